@@ -1,0 +1,36 @@
+"""A differentiable double pendulum, and the motions released from rest that come back.
+
+Angles in radians, SI units. The public names are those below; each module's page says what it computes and how.
+"""
+
+from dpend import _runtime as _runtime  # sets JAX up: before anything else
+from dpend.orbits import PeriodicOrbit as PeriodicOrbit
+from dpend.orbits import find_orbit as find_orbit
+from dpend.pendulum import BobEnergies as BobEnergies
+from dpend.pendulum import Equilibria as Equilibria
+from dpend.pendulum import NormalMode as NormalMode
+from dpend.pendulum import Pendulum as Pendulum
+from dpend.pendulum import Positions as Positions
+from dpend.pendulum import State as State
+from dpend.pendulum import energies as energies
+from dpend.pendulum import equilibria as equilibria
+from dpend.pendulum import hamiltonian as hamiltonian
+from dpend.pendulum import momenta as momenta
+from dpend.pendulum import normal_modes as normal_modes
+from dpend.pendulum import positions as positions
+from dpend.pendulum import released as released
+from dpend.pendulum import vector_field as vector_field
+from dpend.pendulum import velocities as velocities
+from dpend.stability import monodromy as monodromy
+from dpend.stability import multipliers as multipliers
+from dpend.stability import stability_class as stability_class
+from dpend.steppers import Scheme as Scheme
+from dpend.trajectory import Status as Status
+from dpend.trajectory import Trajectory as Trajectory
+from dpend.trajectory import flow as flow
+from dpend.trajectory import fold as fold
+from dpend.trajectory import message as message
+from dpend.trajectory import reference as reference
+from dpend.trajectory import simulate as simulate
+
+__version__ = "0.1.0"

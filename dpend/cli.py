@@ -1,0 +1,332 @@
+"""The command line: the only module that prints. Angles are in degrees here, and nowhere else but in CSV and JSON.
+
+Exit status 0: done. 1: ran, but some solve failed, or the environment is wrong. 2: bad input, one line on standard
+error. 130: interrupted.
+"""
+
+import csv
+import json
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import typer
+
+import dpend
+from dpend.orbits import BRANCHES, PeriodicOrbit
+from dpend.pendulum import Pendulum, State, number
+from dpend.trajectory import Status, Trajectory
+
+app = typer.Typer(
+    name="dpend",
+    help="The motions of a double pendulum that come back. Angles in degrees, everything else in SI units.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+_Length1 = Annotated[float, typer.Option("--l1", help="Length of the upper rod [m].")]
+_Length2 = Annotated[float, typer.Option("--l2", help="Length of the lower rod [m].")]
+_Mass1 = Annotated[float, typer.Option("--m1", help="Mass of the upper bob [kg].")]
+_Mass2 = Annotated[float, typer.Option("--m2", help="Mass of the lower bob [kg].")]
+_Gravity = Annotated[float, typer.Option("--g", help="Acceleration of gravity [m/s^2].")]
+_Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+_Theta1 = Annotated[float, typer.Option("--theta1", help="Release angle of the upper rod [deg].")]
+
+
+@app.callback()
+def _commands() -> None:
+    """Keeps `dpend orbit` a subcommand."""
+
+
+@app.command()
+def orbit(
+    theta1: _Theta1,
+    branch: Annotated[
+        str | None, typer.Option(help="in-phase or anti-phase; both, if neither this nor a guess is given.")
+    ] = None,
+    theta2: Annotated[float | None, typer.Option(help="Guess of the lower rod's release angle [deg].")] = None,
+    period: Annotated[float | None, typer.Option(help="Guess of the period [s].")] = None,
+    symmetry: Annotated[
+        str | None, typer.Option(help="centred or brake, with a guess; found out if not given.")
+    ] = None,
+    ratio: Annotated[
+        int | None, typer.Option(help="1 or -1: ask for theta2 = ratio theta1, with theta1 nearest to the one given.")
+    ] = None,
+    crossing: Annotated[int, typer.Option(help="Which of the branch's passages through theta1.")] = 1,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """The releases from rest at THETA1 that come back: partner angle, period, stability, error."""
+    pendulum = Pendulum(l1, l2, m1, m2, g)
+    release = _radians("theta1", theta1)
+    if (theta2 is None) != (period is None):
+        given, missing = ("theta2", "period") if period is None else ("period", "theta2")
+        raise ValueError(f"{missing} must be given with {given}, got {given} alone: a guess is both")
+    guess = None if theta2 is None else (_radians("theta2", theta2), number("period", period, positive=True, unit="s"))
+    both = branch is None and guess is None and ratio is None
+    found = {
+        name: dpend.find_orbit(
+            pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=crossing
+        )
+        for name in (BRANCHES if both else (branch,))
+    }
+    records = [_orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()]
+    if as_json:
+        _print_json({"orbits": records} if both else records[0])
+    else:
+        _print_orbits(pendulum, found)
+    return 0 if all(int(orbit.status) == Status.CONVERGED for orbit in found.values()) else 1
+
+
+@app.command()
+def simulate(
+    theta1: _Theta1,
+    theta2: Annotated[float, typer.Option(help="Release angle of the lower rod [deg].")],
+    duration: Annotated[float, typer.Option(help="How long [s]; negative runs backwards.")],
+    p1: Annotated[float, typer.Option("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")] = 0.0,
+    p2: Annotated[float, typer.Option("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")] = 0.0,
+    method: Annotated[str, typer.Option(help="rk4 or rk8.")] = "rk8",
+    step: Annotated[float | None, typer.Option(help="Largest step [s].")] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")] = None,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """The motion from a release, and how far its end may be believed."""
+    pendulum = Pendulum(l1, l2, m1, m2, g)
+    state = State(_radians("theta1", theta1), _radians("theta2", theta2), number("p1", p1), number("p2", p2))
+    write = _writer(out) if out is not None else None
+    motion = dpend.simulate(pendulum, state, duration, step=step, method=method, tolerance=tolerance)
+    if write is not None:
+        write(motion)
+    record = _motion_record(motion)
+    if as_json:
+        _print_json(record)
+    else:
+        _print_motion(record, motion, out)
+    return 0 if int(motion.status) == Status.CONVERGED else 1
+
+
+# --- what is read ----------------------------------------------------------------------------------------------------
+
+
+def _radians(name: str, degrees: float) -> float:
+    return math.radians(number(name, degrees, unit="deg"))
+
+
+# --- what is printed -------------------------------------------------------------------------------------------------
+
+
+def _orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
+    angle_error, period_error = orbit.error_estimate
+    status = Status(int(orbit.status))
+    return {
+        "theta1_deg": _degrees(orbit.theta1),
+        "theta2_deg": _degrees(orbit.theta2),
+        "period_s": float(orbit.period),
+        "energy_J": float(orbit.energy),
+        "residual": float(orbit.residual),
+        "iterations": int(orbit.iterations),
+        "status": status.name.lower(),
+        "message": dpend.message(status),
+        "symmetry": orbit.symmetry,
+        "kappa": float(orbit.kappa),
+        "log_abs_kappa": float(orbit.log_abs_kappa),
+        "stability": orbit.stability,
+        "dual": {"theta1_deg": _degrees(orbit.dual.theta1), "theta2_deg": _degrees(orbit.dual.theta2)},
+        "turns": [int(turn) for turn in orbit.turns],
+        "error_estimate": {"theta2_deg": _degrees(angle_error), "period_s": float(period_error)},
+        "pendulum": _pendulum_record(orbit.pendulum),
+    }
+
+
+def _pendulum_record(pendulum: Pendulum) -> dict[str, float]:
+    names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
+    return {key: float(getattr(pendulum, name)) for name, key in names.items()}
+
+
+def _motion_record(motion: Trajectory) -> dict[str, Any]:
+    status = Status(int(motion.status))
+    assert motion.scheme is not None
+    return {
+        "final": {
+            "theta1_deg": _degrees(motion.state.theta1[-1]),
+            "theta2_deg": _degrees(motion.state.theta2[-1]),
+            "p1": float(motion.state.p1[-1]),
+            "p2": float(motion.state.p2[-1]),
+        },
+        "duration_s": float(motion.time[-1]),
+        "energy_drift": float(motion.energy_drift),
+        "error_estimate": float(motion.error_estimate),
+        "steps": int(motion.steps),
+        "method": motion.scheme.name,
+        "step_s": abs(float(motion.time[-1])) / int(motion.steps),
+        "status": status.name.lower(),
+        "message": dpend.message(status),
+    }
+
+
+def _degrees(radians: Any) -> float:
+    return math.degrees(float(radians))
+
+
+def _print_json(record: dict[str, Any]) -> None:
+    def clean(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: clean(item) for key, item in value.items()}
+        if isinstance(value, list):
+            return [clean(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    print(json.dumps(clean(record), indent=2, allow_nan=False))
+
+
+def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=_described(pendulum), title_justify="left", title_style="")
+    for heading in ("", "theta1 (deg)", "theta2 (deg)", "period (s)", "stability", "kappa", "error (deg, s)"):
+        table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
+    failures = []
+    for name, orbit in found.items():
+        record = _orbit_record(orbit)
+        error = record["error_estimate"]
+        table.add_row(
+            name or record["symmetry"],
+            f"{record['theta1_deg']:.10g}",
+            f"{record['theta2_deg']:.9f}",
+            f"{record['period_s']:.11f}",
+            record["stability"],
+            f"{record['kappa']:.6g}",
+            f"{error['theta2_deg']:.0e}, {error['period_s']:.0e}",
+        )
+        if record["status"] != "converged":
+            failures.append(f"{name or 'guess'}: {record['status']}: {record['message']}")
+    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    for failure in failures:
+        print(failure)
+
+
+def _described(pendulum: Pendulum) -> str:
+    values = (float(value) for value in jax.tree.leaves(pendulum))
+    return "l1 = {:g} m, l2 = {:g} m, m1 = {:g} kg, m2 = {:g} kg, g = {:g} m/s^2, released from rest".format(*values)
+
+
+def _print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) -> None:
+    final = record["final"]
+    print(f"after {record['duration_s']:g} s   theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg")
+    print(f"                p1 = {final['p1']:.12g}, p2 = {final['p2']:.12g} kg m^2/s")
+    print(f"error estimate  {record['error_estimate']:.1e} rad, energy drift {record['energy_drift']:.1e} of its scale")
+    print(f"integrated by   {record['method']}, {record['steps']} steps of {record['step_s']:.4g} s")
+    if record["status"] != "converged":
+        print(f"{record['status']}: {record['message']}")
+    if out is not None:
+        print(f"written to      {out}: {motion.time.size} times")
+
+
+# --- what is written -------------------------------------------------------------------------------------------------
+
+
+def _writer(path: Path) -> Callable[[Trajectory], None]:
+    """How to write a motion to `path`; refuses before anything is computed what could not be written after."""
+    formats = {".csv": _write_csv, ".nc": _write_netcdf}
+    if path.suffix not in formats:
+        raise ValueError(f"out must end in {' or '.join(formats)}, got {path}: give another name")
+    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise ValueError(f"out must be a file in a directory that can be written to, got {path}: give another place")
+
+    def write(motion: Trajectory) -> None:
+        # A temporary name first: a file that is there, old or new, is always whole.
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        try:
+            formats[path.suffix](motion, Path(name))
+            os.chmod(name, 0o644)
+            os.replace(name, path)
+        except BaseException:
+            os.unlink(name)
+            raise
+
+    return write
+
+
+def _write_csv(motion: Trajectory, path: Path) -> None:
+    state = motion.state
+    columns = (motion.time, np.degrees(state.theta1), np.degrees(state.theta2), state.p1, state.p2)
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["time_s", "theta1_deg", "theta2_deg", "p1_kg_m2_s", "p2_kg_m2_s"])
+        rows.writerows(zip(*(np.asarray(column).tolist() for column in columns), strict=True))
+
+
+def _write_netcdf(motion: Trajectory, path: Path) -> None:
+    motion.to_xarray().to_netcdf(path, engine="scipy")
+
+
+# --- the program -----------------------------------------------------------------------------------------------------
+
+
+def _keep_compiled_code() -> None:
+    """Points JAX's compilation cache at the user's cache directory, unless the user has chosen: later runs start warm."""
+    if jax.config.jax_compilation_cache_dir is not None:
+        return
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dpend"
+    try:
+        base.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(base, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(base))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def _complain(error: BaseException) -> None:
+    print("dpend: " + " ".join(str(error).split()), file=sys.stderr)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The entry point: runs one command and exits with its status."""
+    sys.exit(_run(sys.argv[1:] if arguments is None else list(arguments)))
+
+
+def _run(arguments: list[str]) -> int:
+    # The process is this program's own, so that float64 is ours to switch on even where JAX is to be left plain.
+    if "JAX_ENABLE_X64" not in os.environ:
+        jax.config.update("jax_enable_x64", True)
+    _keep_compiled_code()
+    try:
+        return int(app(arguments, standalone_mode=False) or 0)
+    except (KeyboardInterrupt, typer.Abort):
+        return 130
+    except typer.Exit as stop:
+        return stop.exit_code
+    except (ValueError, OSError) as error:
+        _complain(error)
+        return 2
+    except RuntimeError as error:
+        # The command line's own usage errors are RuntimeErrors that know how to say what was wrong with the arguments.
+        usage = getattr(error, "format_message", None)
+        _complain(RuntimeError(usage()) if usage else error)
+        return 2 if usage else 1
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,826 @@
+"""Periodic orbits released from rest, by symmetric shooting with Newton's method.
+
+Shooting for a periodic orbit of a conservative system is singular by two. Released from rest it is not: with theta1 given,
+theta2 and the period are two unknowns for two equations, without a phase or an energy condition.
+
+- brake: p(T/2) = 0, at rest again at the dual release;
+- centred: theta(T/4) = 0 modulo pi, half the integration, and x(T/2) = -x(0) up to full turns follows. Time reversal
+  about T/4 does it (Lamb and Roberts, Physica D 112, 1998, on reversing symmetries; Munoz-Almaraz et al., Physica D 181,
+  2003, on continuing symmetric orbits in a conservative system).
+
+A branch is followed from its normal mode by pseudo-arclength in (theta1, theta2, log of the shooting time), so that
+turning points in theta1 are passed. Everything is traceable; derivatives with respect to the pendulum and the release
+angle come from the implicit function theorem at the root, never from Newton's iterations.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from dpend._runtime import require_float64
+from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, normal_modes, number, released, vector_field
+from dpend.stability import half_trace, kappa_of_brake, stability_class, transition
+from dpend.steppers import Scheme
+from dpend.trajectory import Status, known_value, march, nothing
+
+BRANCHES = ("in-phase", "anti-phase")
+SYMMETRIES = ("centred", "brake")
+# What part of the period is integrated.
+_PARTS = {"centred": 4, "brake": 2}
+
+_RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
+# rate times step [rad]: 0.06 leaves errors of some 1e-13 in theta2 and T; the walk along a branch needs no such digits.
+_FINE, _COARSE = 0.06, 0.25
+# A number of steps at which a motion cannot be what was meant: the search is lost.
+_MOST_STEPS = 200_000
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PeriodicOrbit:
+    """A periodic orbit released from rest, or many of one shape.
+
+    Attributes:
+        pendulum: its pendulum.
+        state: at t = 0, at rest.
+        period: the minimal one [s].
+        energy: H [J], zero for both bobs at rest at the pivot's height.
+        residual: of the equations solved: angles at T/4 [rad] if centred, else momenta at T/2 in units of
+            m2 l2 sqrt(g l2); the larger of the two.
+        iterations: Newton iterations spent on it, each one integration with its Jacobian and one linear solve; on a branch
+            those of the walk's last step and those at the wanted release.
+        kappa: half the sum of the two non-trivial Floquet multipliers.
+        log_abs_kappa: log |kappa|, natural.
+        dual: the other rest of the orbit, at T/2.
+        turns: theta(T/4)/pi of a centred orbit, two integers; zeros otherwise.
+        error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s]: the change on solving again at half the
+            step; NaN if that was not asked for.
+        status: a value of `Status`.
+        symmetry: `centred` or `brake`.
+    """
+
+    pendulum: Pendulum
+    state: State
+    period: Scalar
+    energy: Scalar
+    residual: Scalar
+    iterations: Scalar
+    kappa: Scalar
+    log_abs_kappa: Scalar
+    dual: State
+    turns: tuple[Scalar, Scalar]
+    error_estimate: tuple[Scalar, Scalar]
+    status: Scalar
+    symmetry: str = field(metadata={"static": True})
+
+    @property
+    def theta1(self) -> Scalar:
+        """The release angle of the upper rod [rad]."""
+        return self.state.theta1
+
+    @property
+    def theta2(self) -> Scalar:
+        """The release angle of the lower rod [rad], its partner."""
+        return self.state.theta2
+
+    @property
+    def stability(self) -> str:
+        """`elliptic`, `hyperbolic` or `inverse hyperbolic`, of a single orbit."""
+        return stability_class(float(self.kappa))
+
+
+# --- the equations ---------------------------------------------------------------------------------------------------
+
+
+class _Line(NamedTuple):
+    """The releases among which Newton's method searches: (theta1, theta2) = base + x direction."""
+
+    base: Float[Array, "2"]
+    direction: Float[Array, "2"]
+
+
+class _Shot(NamedTuple):
+    """The equations at one point: their value, and the Jacobian in (theta1, theta2, log of the shooting time)."""
+
+    value: Float[Array, "2"]
+    jacobian: Float[Array, "2 3"]
+    matrix: Float[Array, "4 4"]
+    end: State
+    rate: Scalar
+
+
+def _clock(pendulum: Pendulum) -> Scalar:
+    """The rate that a pendulum's linear motions never exceed [rad/s]."""
+    return normal_modes(pendulum)[1].frequency
+
+
+def _momentum_unit(pendulum: Pendulum) -> Scalar:
+    return pendulum.m2 * pendulum.l2 * jnp.sqrt(pendulum.g * pendulum.l2)
+
+
+def _steps_for(log_time: Scalar, rate: Scalar, turn: float) -> Scalar:
+    """How many steps a shooting time takes if the fastest motion may advance by `turn` [rad] in each."""
+    wanted = jnp.ceil(jnp.exp(log_time) * rate / turn)
+    return jnp.clip(jnp.nan_to_num(wanted, nan=8.0), 8, _MOST_STEPS).astype(int)
+
+
+def _fastest(pendulum: Pendulum, state: State) -> Scalar:
+    """The rate that decides the step [rad/s]: of the linear motion, and of the rods and the angle between them."""
+    rates = vector_field(pendulum, state)
+    spin = rates.theta1**2 + rates.theta2**2 + (rates.theta1 - rates.theta2) ** 2
+    return jnp.sqrt(_clock(pendulum) ** 2 + spin)
+
+
+def _shoot(
+    pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, symmetry: str, turns: Array
+) -> _Shot:
+    """The equations of `symmetry` for a release at `angles`, after a time exp(log_time) in `steps` steps.
+
+    The brake equations are divided by the time: p(t) = 0 has the root t = 0, and p(t)/t has not.
+    """
+    time = jnp.exp(log_time)
+    state = released(*angles)
+
+    def advance(pair: Any, dt: Scalar) -> Any:
+        return _RK8.advance_tangents(pendulum, *pair, dt)
+
+    def faster(rate: Scalar, time: Scalar, dt: Scalar, pair: Any) -> Scalar:
+        return jnp.fmax(rate, _fastest(pendulum, pair[0]))
+
+    start = (state, State(*jnp.eye(4)))
+    (end, tangents), rate = march(advance, start, time / steps, steps, faster, _fastest(pendulum, state))
+    matrix = jnp.stack(jax.tree.leaves(tangents))
+    slope = vector_field(pendulum, end)
+    if symmetry == "centred":
+        value = jnp.stack([end.theta1, end.theta2]) - jnp.pi * turns
+        jacobian = jnp.column_stack([matrix[:2, :2], time * jnp.stack([slope.theta1, slope.theta2])])
+    else:
+        unit = _momentum_unit(pendulum) * time * _clock(pendulum)
+        value = jnp.stack([end.p1, end.p2]) / unit
+        jacobian = jnp.column_stack([matrix[2:, :2], time * jnp.stack([slope.p1, slope.p2])]) / unit
+        jacobian = jacobian.at[:, 2].add(-value)
+    return _Shot(value, jacobian, matrix, end, rate)
+
+
+# --- Newton's method on a line ---------------------------------------------------------------------------------------
+
+# The largest update of x [rad] and of log T in one iteration.
+_LARGEST_UPDATE = 0.5
+# Updates below this many units of rounding, grown as the motion grows, are noise.
+_ROUNDING = 64 * np.finfo(np.float64).eps
+_LEAST_DAMPING = 2.0**-12
+
+
+class _Newton(NamedTuple):
+    x: Scalar
+    log_time: Scalar
+    size: Scalar
+    shot: _Shot
+    update: Float[Array, "2"]
+    damping: Scalar
+    iterations: Scalar
+    status: Scalar
+
+
+def _newton(
+    pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, steps: Scalar, turns: Array, symmetry: str,
+    tolerance: Scalar, max_iterations: Scalar,
+) -> _Newton:  # fmt: skip
+    """Damped Newton for (x, log of the shooting time), the step count held fixed so that the equations are smooth.
+
+    An update that does not reduce the residual is halved. It has converged when the next update is below `tolerance`
+    (relative to the amplitude, at most 1), or when the residual is down to rounding and falls no further.
+    """
+
+    def shoot(x: Scalar, log_time: Scalar) -> _Shot:
+        return _shoot(pendulum, line.base + x * line.direction, log_time, steps, symmetry, turns)
+
+    def newton_update(shot: _Shot) -> Array:
+        square = jnp.column_stack([shot.jacobian[:, :2] @ line.direction, shot.jacobian[:, 2]])
+        determinant = square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0]
+        adjugate = jnp.array([[square[1, 1], -square[0, 1]], [-square[1, 0], square[0, 0]]])
+        return -(adjugate @ shot.value) / determinant
+
+    def iterate(s: _Newton) -> _Newton:
+        trial = jnp.stack([s.x, s.log_time]) + s.damping * s.update
+        shot = shoot(*trial)
+        size = jnp.max(jnp.abs(shot.value))
+        better = size < s.size
+        amplitude = jnp.minimum(1.0, jnp.max(jnp.abs(line.base + trial[0] * line.direction)))
+        floor = _ROUNDING * jnp.max(jnp.abs(shot.jacobian)) * amplitude
+        stalled = ~better & (s.size <= floor)
+        update = newton_update(shot)
+        largest = jnp.max(jnp.abs(update) / jnp.stack([amplitude, 1.0]))
+        converged = (better & (largest <= tolerance)) | stalled
+        singular = better & ~jnp.all(jnp.isfinite(update))
+        lost = ~better & (s.damping <= _LEAST_DAMPING)
+        trivial = jnp.exp(trial[1]) * _clock(pendulum) < _SHORTEST
+        status = jnp.where(lost, Status.MAX_ITERATIONS, _RUNNING)
+        status = jnp.where(singular, Status.SINGULAR, status)
+        status = jnp.where(better & trivial, Status.TRIVIAL_ROOT, status)
+        status = jnp.where(converged, Status.CONVERGED, status)
+        update = update * jnp.minimum(1.0, _LARGEST_UPDATE / jnp.max(jnp.abs(update)))
+        keep = partial(jnp.where, better)
+        return _Newton(
+            x=keep(trial[0], s.x),
+            log_time=keep(trial[1], s.log_time),
+            size=keep(size, s.size),
+            shot=jax.tree.map(keep, shot, s.shot),
+            update=keep(update, s.update),
+            damping=jnp.where(better, jnp.minimum(1.0, 2 * s.damping), s.damping / 2),
+            iterations=s.iterations + 1,
+            status=status,
+        )
+
+    blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan), jax.eval_shape(shoot, x, log_time))
+    start = _Newton(
+        x, log_time, jnp.asarray(jnp.inf), blank, jnp.zeros(2), jnp.asarray(1.0), jnp.asarray(0), jnp.asarray(_RUNNING)
+    )
+    end = lax.while_loop(lambda s: (s.status == _RUNNING) & (s.iterations < max_iterations), iterate, start)
+    status = jnp.where(end.status == _RUNNING, Status.MAX_ITERATIONS, end.status)
+    return end._replace(status=jnp.where(jnp.isfinite(end.size), status, Status.NONFINITE))
+
+
+_RUNNING = -1
+# No brake orbit has a shooting time this short in units of the fast mode [rad]: the search ran into T = 0.
+_SHORTEST = 0.02
+
+
+# --- following a branch ----------------------------------------------------------------------------------------------
+
+# Arclength steps in (theta1, theta2, log time) [rad]: the first is where the normal mode is still true to 1e-4, the
+# longest turns by less than the angle below on the families of twenty pendulums that were tried.
+_FIRST_STEP, _LONGEST_STEP, _SHORTEST_STEP = 0.02, 0.5, 1e-8
+# A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of the step's length).
+_LEAST_COSINE, _LARGEST_MISS, _WANTED_MISS = 0.95, 0.1, 0.02
+_MOST_POINTS = 1500
+_WALK_TOLERANCE = 1e-6
+# Closer than this to the upright state [rad] the branch counts as ended in its homoclinic limit.
+_UPRIGHT = 1e-4
+# Back within this of the normal mode it started from [rad], the branch is a closed curve.
+_AT_ORIGIN = 0.05
+# Each step is looked at in this many pieces for crossings, two turning points within one of them being out of the question.
+_PIECES = 16
+
+
+class _Corrected(NamedTuple):
+    """A point of a family with its unit tangent; the rate met on the orbit; how many iterations, and whether enough."""
+
+    point: Float[Array, "3"]
+    tangent: Float[Array, "3"]
+    rate: Scalar
+    iterations: Scalar
+    converged: Scalar
+
+
+def _corrected(
+    pendulum: Pendulum, predicted: Array, tangent: Array, steps: Scalar, turns: Array, symmetry: str, tolerance: Scalar
+) -> _Corrected:
+    """The point of the family in the plane through `predicted` normal to `tangent`: the step that families repeat.
+
+    The unknowns are (theta1, theta2, log of the shooting time). Both the bordered 3 x 3 system and the new tangent, the
+    null vector of the Jacobian, are written with cross products (Cramer's rule).
+    """
+
+    def iterate(carry: tuple) -> tuple:
+        point, _, _, _, count = carry
+        shot = _shoot(pendulum, point[:2], point[2], steps, symmetry, turns)
+        one, two = shot.jacobian
+        null = jnp.cross(one, two)
+        columns = jnp.stack([jnp.cross(two, tangent), jnp.cross(tangent, one), null])
+        short = jnp.append(shot.value, tangent @ (point - predicted))
+        update = -(short @ columns) / (null @ tangent)
+        return point + update, null, shot.rate, jnp.max(jnp.abs(update)), count + 1
+
+    def unfinished(carry: tuple) -> Scalar:
+        _, _, _, size, count = carry
+        return (count == 0) | ((size > tolerance) & (size < 1.0) & (count < 6))
+
+    start = (predicted, tangent, jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0))
+    point, null, rate, size, count = lax.while_loop(unfinished, iterate, start)
+    new = null / jnp.linalg.norm(null)
+    return _Corrected(point, jnp.where(new @ tangent < 0, -new, new), rate, count, size <= tolerance)
+
+
+class _Piece(NamedTuple):
+    """A step along a family as a cubic: its ends, the unit tangents there, and the distance between them."""
+
+    start: Float[Array, "3"]
+    slope: Float[Array, "3"]
+    end: Float[Array, "3"]
+    end_slope: Float[Array, "3"]
+    length: Scalar
+
+    def at(self, s: Scalar) -> Array:
+        """The cubic Hermite interpolant at s in [0, 1]; beyond 1 it predicts the next point."""
+        s2, s3 = s * s, s * s * s
+        return (
+            (2 * s3 - 3 * s2 + 1) * self.start
+            + (s3 - 2 * s2 + s) * self.length * self.slope
+            + (3 * s2 - 2 * s3) * self.end
+            + (s3 - s2) * self.length * self.end_slope
+        )
+
+
+class _Walk(NamedTuple):
+    piece: _Piece
+    step: Scalar
+    rate: Scalar
+    iterations: Scalar
+    points: Scalar
+    attempts: Scalar
+    crossings: Scalar
+    best: Float[Array, "3"]
+    reach: Float[Array, "3"]
+    away: Scalar
+    found: Scalar
+    status: Scalar
+
+
+def _walk(pendulum: Pendulum, mode: Any, target: Scalar, crossing: Scalar, ratio: int | None) -> _Walk:
+    """Follows a centred family from its normal mode to where it meets the wanted release.
+
+    Without `ratio` that is the `crossing`-th time that |theta1| = target; the orbit released at (-theta1, -theta2) is the
+    same one, half a period later. With `ratio` it is, of all releases with theta2 = ratio theta1, the one whose theta1 is
+    nearest to `target`.
+    """
+    origin = jnp.stack([0.0, 0.0, jnp.log(mode.period / 4)])
+    slope = jnp.stack([1.0, mode.ratio, 0.0]) / jnp.sqrt(1 + mode.ratio**2)
+    turns = jnp.zeros(2)
+
+    def wanted(point: Array) -> Scalar:
+        return jnp.abs(point[0]) - target if ratio is None else point[1] - ratio * point[0]
+
+    def advance(w: _Walk) -> _Walk:
+        piece = w.piece
+        tangent = piece.end_slope
+        # Without a step behind it the cubic has length zero: then the tangent alone predicts.
+        along = jnp.where(w.points > 0, 1 + w.step / jnp.where(w.points > 0, piece.length, 1.0), 1.0)
+        predicted = jnp.where(w.points > 0, piece.at(along), piece.end + w.step * tangent)
+        steps = _steps_for(predicted[2], w.rate, _COARSE)
+        new = _corrected(pendulum, predicted, tangent, steps, turns, "centred", _WALK_TOLERANCE)
+        miss = jnp.max(jnp.abs(new.point - predicted)) / w.step
+        resolved = _steps_for(new.point[2], new.rate, _COARSE) <= 1.5 * steps
+        good = new.converged & (new.tangent @ tangent >= _LEAST_COSINE) & (miss <= _LARGEST_MISS)
+        length = jnp.linalg.norm(new.point - piece.end)
+        taken = _Piece(piece.end, tangent, new.point, new.tangent, length)
+        growth = jnp.clip((_WANTED_MISS / jnp.fmax(miss, 1e-9)) ** 0.25, 0.5, 2.0)
+        held = jnp.where(good | ~new.converged, w.rate, jnp.fmax(w.rate, new.rate))
+        after = w._replace(
+            piece=taken,
+            step=jnp.minimum(w.step * growth, _LONGEST_STEP),
+            rate=new.rate,
+            iterations=new.iterations,
+            points=w.points + 1,
+            reach=jnp.where(jnp.abs(new.point[0]) > jnp.abs(w.reach[0]), new.point, w.reach),
+        )
+        after = _looked_at(after, wanted, target, crossing, ratio, origin)
+        back = w._replace(step=jnp.where(good, w.step, w.step / 2), rate=jnp.where(good, new.rate, held))
+        chosen = jax.tree.map(partial(jnp.where, good & resolved), after, back)
+        gave_up = (chosen.step < _SHORTEST_STEP) | (chosen.points >= _MOST_POINTS) | (w.attempts >= 3 * _MOST_POINTS)
+        status = jnp.where((chosen.status == _RUNNING) & gave_up, Status.MAX_ITERATIONS, chosen.status)
+        return chosen._replace(attempts=w.attempts + 1, status=status)
+
+    zero = jnp.asarray(0)
+    start = _Walk(
+        _Piece(origin, slope, origin, slope, jnp.asarray(0.0)), jnp.asarray(_FIRST_STEP), _clock(pendulum),
+        zero, zero, zero, zero, origin, origin, jnp.asarray(False), jnp.asarray(False), jnp.asarray(_RUNNING),
+    )  # fmt: skip
+    return lax.while_loop(lambda w: w.status == _RUNNING, advance, start)
+
+
+def _looked_at(walk: _Walk, wanted: Any, target: Scalar, crossing: Scalar, ratio: int | None, origin: Array) -> _Walk:
+    """The walk after its newest step has been searched for the wanted release and for the end of the branch."""
+    points = jax.vmap(walk.piece.at)(jnp.arange(_PIECES + 1) / _PIECES)
+    values = jax.vmap(wanted)(points)
+    changes = values[:-1] * values[1:] < 0
+    seen = walk.crossings + jnp.cumsum(changes)
+    if ratio is None:
+        here = changes & (seen == crossing)
+    else:
+        nearness = jnp.where(changes, jnp.abs(jnp.abs(points[1:, 0]) - target), jnp.inf)
+        closer = jnp.min(nearness) < jnp.where(walk.found, jnp.abs(jnp.abs(walk.best[0]) - target), jnp.inf)
+        here = (jnp.arange(_PIECES) == jnp.argmin(nearness)) & closer
+    hit = jnp.any(here)
+    left = jnp.argmax(here) / _PIECES
+    sign = jnp.sign(wanted(walk.piece.at(left)))
+
+    def halve(_: int, bounds: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        before = wanted(walk.piece.at(middle)) * sign > 0
+        return jnp.where(before, middle, low), jnp.where(before, high, middle)
+
+    low, high = lax.fori_loop(0, 50, halve, (left, left + 1 / _PIECES))
+    amplitude = jnp.max(jnp.abs(points[:, :2]), axis=1)
+    closed = walk.away & jnp.any((amplitude < _AT_ORIGIN) & (jnp.abs(points[:, 2] - origin[2]) < _AT_ORIGIN))
+    from_upright = jnp.abs(jnp.mod(walk.piece.end[:2], 2 * jnp.pi) - jnp.pi)
+    ended = closed | (jnp.max(from_upright) < _UPRIGHT)
+    found = walk.found | hit
+    over = jnp.where(found, Status.CONVERGED, Status.NO_SUCH_ORBIT)
+    if ratio is None:
+        stop = ended | hit
+    else:  # further on only a branch that turned back could come nearer to the target
+        best = jnp.where(hit, walk.piece.at(0.5 * (low + high)), walk.best)
+        stop = ended | (found & (jnp.abs(walk.piece.end[0]) - target > jnp.abs(jnp.abs(best[0]) - target)))
+    return walk._replace(
+        crossings=seen[-1],
+        best=jnp.where(hit, walk.piece.at(0.5 * (low + high)), walk.best),
+        away=walk.away | (amplitude[-1] > 4 * _AT_ORIGIN),
+        found=found,
+        status=jnp.where(stop, over, walk.status),
+    )
+
+
+# --- from a root to an orbit -----------------------------------------------------------------------------------------
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _implicit(symmetry: str, root: Array, parameters: Array, direction: Array, steps: Array) -> Array:
+    """`root` = (x, log of the shooting time), whose value is known already, as a function of the parameters.
+
+    F(root, parameters) = 0 gives d root = -(dF/d root)^-1 (dF/d parameters) d parameters. Both Jacobians are taken forwards
+    and do not depend on the tangent, so that the rule can be transposed although the loop of the flow cannot.
+
+    Arguments:
+        parameters: l1, l2, m1, m2, g and the line's base, shape (7,).
+        steps: how many, as a float, since a rule's arguments need tangents.
+    """
+    return root
+
+
+@_implicit.defjvp
+def _implicit_jvp(symmetry, primals, tangents):  # type: ignore[no-untyped-def]
+    _, parameters, direction, steps = primals
+    root = _implicit(symmetry, *primals)  # by way of this rule, so that second derivatives know how the root moves
+
+    def equations(both: Array) -> Array:
+        (x, log_time), parameters = both[:2], both[2:]
+        pendulum, time, count = Pendulum(*parameters[:5]), jnp.exp(log_time), steps.astype(int)
+        start = released(*(parameters[5:] + x * direction))
+        advance = partial(_RK8.advance, pendulum)
+        end, _ = march(advance, start, time / count, count, nothing, None)
+        # Momenta without their unit: at a root the factor does not matter.
+        return jnp.stack([end.theta1, end.theta2] if symmetry == "centred" else [end.p1, end.p2])
+
+    jacobian = jax.jacfwd(equations)(jnp.concatenate([root, parameters]))
+    return root, -jnp.linalg.solve(jacobian[:, :2], jacobian[:, 2:] @ tangents[1])
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _kappas(symmetry: str, value: Array, orbit: Array, steps: Array) -> Array:
+    """`value` = (kappa, log |kappa|), known from the root's own integration, as a function of the orbit.
+
+    Arguments:
+        orbit: l1, l2, m1, m2, g, theta1, theta2 and the log of the shooting time, shape (8,).
+    """
+    return value
+
+
+@_kappas.defjvp
+def _kappas_jvp(symmetry, primals, tangents):  # type: ignore[no-untyped-def]
+    _, orbit, steps = primals
+
+    def again(orbit: Array) -> Array:
+        count = steps.astype(int)
+        _, matrix = transition(Pendulum(*orbit[:5]), released(*orbit[5:7]), jnp.exp(orbit[7]) / count, count, _RK8)
+        return _kappas_of(symmetry, matrix)
+
+    return _kappas(symmetry, *primals), jax.jacfwd(again)(orbit) @ tangents[1]
+
+
+def _kappas_of(symmetry: str, matrix: Array) -> Array:
+    """kappa and log |kappa| from the transition matrix over the shooting time; the logarithm cannot overflow."""
+    if symmetry == "centred":
+        c = half_trace(matrix)
+        kappa = 2 * c * c - 1
+        large = jnp.abs(c) > 1e6
+        logarithm = jnp.where(large, jnp.log(2.0) + 2 * jnp.log(jnp.abs(jnp.where(large, c, 1.0))), jnp.log(jnp.abs(kappa)))
+    else:
+        kappa = kappa_of_brake(matrix)
+        logarithm = jnp.log(jnp.abs(kappa))
+    return jnp.stack([kappa, logarithm])
+
+
+def _solved(
+    pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, rate: Scalar, turns: Array, symmetry: str, settings: "_Settings"
+) -> tuple[_Newton, Scalar, Array]:
+    """Newton's root from a close guess, the number of steps it used, and the change of (x, T) at half the step."""
+    steps = _steps_for(log_time, rate, settings.turn)
+
+    def level(carry: tuple[Scalar, Scalar], factor: Scalar) -> tuple[tuple[Scalar, Scalar], _Newton]:
+        newton = _newton(pendulum, line, *carry, factor * steps, turns, symmetry, settings.tolerance, settings.max_iterations)
+        return (newton.x, newton.log_time), newton
+
+    factors = jnp.array([1, 2] if settings.error else [1])
+    _, both = lax.scan(level, (x, log_time), factors)
+    newton = jax.tree.map(lambda leaf: leaf[0], both)
+    change = jnp.full(2, jnp.nan)
+    if settings.error:
+        # The finer root with the update that was too small to be made: else a change below the tolerance would read zero.
+        x, log_time = both.x[1] + both.update[1, 0], both.log_time[1] + both.update[1, 1]
+        period = _PARTS[symmetry] * jnp.exp(newton.log_time)
+        change = jnp.stack([jnp.abs(x - newton.x), period * jnp.abs(jnp.expm1(log_time - newton.log_time))])
+        change = jnp.where(both.status[1] == Status.CONVERGED, change, jnp.nan)
+    return newton, steps, change
+
+
+class _Settings(NamedTuple):
+    """How a root is sought; `error` is static, the rest may be traced."""
+
+    turn: Scalar
+    tolerance: Scalar
+    max_iterations: Scalar
+    error: bool
+
+
+def _orbit(
+    pendulum: Pendulum, line: _Line, newton: _Newton, steps: Scalar, change: Array, turns: Array, symmetry: str, status: Scalar
+) -> PeriodicOrbit:
+    """The orbit at a root; `pendulum` and `line` carry derivatives, the root itself has none yet."""
+    pack = [jnp.asarray(leaf, jnp.float64) for leaf in jax.tree.leaves(pendulum)]
+    steps = steps.astype(jnp.float64)
+    root = jnp.stack([newton.x, newton.log_time])
+    x, log_time = _implicit(symmetry, root, jnp.stack([*pack, *line.base]), line.direction, steps)
+    theta1, theta2 = line.base + x * line.direction
+    state = released(theta1, theta2)
+    known = _kappas_of(symmetry, newton.shot.matrix)
+    kappa, log_abs_kappa = _kappas(symmetry, known, jnp.stack([*pack, theta1, theta2, log_time]), steps)
+    if symmetry == "centred":
+        dual = released(2 * jnp.pi * turns[0] - theta1, 2 * jnp.pi * turns[1] - theta2)
+        residual = newton.size
+    else:
+        dual = released(newton.shot.end.theta1, newton.shot.end.theta2)
+        residual = newton.size * jnp.exp(newton.log_time) * _clock(pendulum)
+    return PeriodicOrbit(
+        pendulum=pendulum,
+        state=state,
+        period=_PARTS[symmetry] * jnp.exp(log_time),
+        energy=hamiltonian(pendulum, state),
+        residual=lax.stop_gradient(residual),
+        iterations=newton.iterations,
+        kappa=kappa,
+        log_abs_kappa=log_abs_kappa,
+        dual=dual,
+        turns=(turns[0].astype(int), turns[1].astype(int)),
+        error_estimate=(change[0], change[1]),
+        status=status,
+        symmetry=symmetry,
+    )
+
+
+def _mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
+    """The mirror image theta -> -theta where `sign` is -1."""
+
+    def flip(state: State) -> State:
+        return State(sign * state.theta1, sign * state.theta2, state.p1, state.p2)
+
+    turns = tuple((sign * turn).astype(int) for turn in orbit.turns)
+    return replace(orbit, state=flip(orbit.state), dual=flip(orbit.dual), turns=turns)
+
+
+@partial(jax.jit, static_argnames=("ratio", "error"))
+def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, max_iterations):  # type: ignore[no-untyped-def]
+    """The orbit where a branch meets theta1 (its `crossing`-th time), or the line theta2 = ratio theta1 nearest to it."""
+    fixed = lax.stop_gradient(pendulum)
+    sign = jnp.where(theta1 < 0, -1.0, 1.0)
+    target = jnp.abs(theta1)
+    modes = normal_modes(fixed)
+    mode = jax.tree.map(lambda a, b: jnp.where(slow, a, b), *modes)
+    walk = _walk(fixed, mode, lax.stop_gradient(target), crossing, ratio)
+    found = walk.found
+    guess = jnp.where(found, walk.best, walk.reach)
+    guess = guess.at[:2].multiply(jnp.where(guess[0] < 0, -1.0, 1.0))  # the same orbit, from its other rest
+    if ratio is None:
+        release = jnp.where(found, target, guess[0])
+        # The cubic's theta2 belongs to the cubic's theta1, which is off by rounding where the target is tiny.
+        x = guess[1] * lax.stop_gradient(release) / guess[0]
+        line = _Line(jnp.stack([release, 0.0]), jnp.array([0.0, 1.0]))
+    else:
+        x = guess[0]
+        line = _Line(jnp.zeros(2), jnp.array([1.0, ratio]))
+    settings = _Settings(turn, tolerance, jnp.where(found, max_iterations, 1), error)
+    turns = jnp.zeros(2)
+    newton, steps, change = _solved(
+        fixed, lax.stop_gradient(line), x, guess[2], walk.rate, turns, "centred", settings
+    )
+    moved = jnp.abs(newton.x - x) > _LEFT * jnp.maximum(walk.piece.length, jnp.abs(x))
+    status = jnp.where((newton.status == Status.CONVERGED) & moved, Status.LEFT_BRANCH, newton.status)
+    status = jnp.where(found, status, walk.status)
+    newton = newton._replace(iterations=newton.iterations + walk.iterations)
+    orbit = _orbit(pendulum, line, newton, steps, change, turns, "centred", status)
+    return _mirrored(orbit, sign)
+
+
+# The walk's cubic is true to a few thousandths of its step: a root further away than this share of it is another orbit.
+_LEFT = 0.1
+
+
+# --- from a guess ----------------------------------------------------------------------------------------------------
+
+# A guess may be any multiple of the minimal period up to this one.
+_LARGEST_COVER = 16
+# How far from rest [units m2 l2 sqrt(g l2)], or from the centre [rad], a shorter orbit may be: the root has 1e-12.
+_SAME = 1e-6
+
+
+@partial(jax.jit, static_argnames=("symmetry", "error"))
+def _near_guess(pendulum, line, x, log_time, symmetry, error, turn, tolerance, max_iterations):  # type: ignore[no-untyped-def]
+    """The orbit to which Newton's method leads from (x, log of the shooting time), with its minimal period."""
+    fixed, still = lax.stop_gradient((pendulum, line))
+    rate = _clock(fixed)
+    for _ in range(2):  # the rate decides the steps, and the steps what rate is seen
+        rate, end = _rate_along(fixed, still, x, log_time, _steps_for(log_time, rate, turn))
+    turns = jnp.round(end / jnp.pi) if symmetry == "centred" else jnp.zeros(2)
+    steps = _steps_for(log_time, rate, turn)
+    first = _newton(fixed, still, x, log_time, steps, turns, symmetry, tolerance, max_iterations)
+    angles = still.base + first.x * still.direction
+    cover, turns = _cover(fixed, angles, first.log_time, steps, turns, symmetry)
+    log_time = first.log_time - jnp.log(cover)
+    settings = _Settings(turn, tolerance, jnp.maximum(max_iterations - first.iterations, 1), error)
+    newton, steps, change = _solved(fixed, still, first.x, log_time, first.shot.rate, turns, symmetry, settings)
+    at_equilibrium = jnp.max(jnp.abs(jnp.sin(angles))) < _SAME
+    status = jnp.where(first.status == Status.CONVERGED, newton.status, first.status)
+    status = jnp.where((status == Status.CONVERGED) & at_equilibrium, Status.TRIVIAL_ROOT, status)
+    newton = newton._replace(iterations=first.iterations + newton.iterations)
+    return _orbit(pendulum, line, newton, steps, change, turns, symmetry, status)
+
+
+def _rate_along(pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, steps: Scalar) -> tuple[Scalar, Array]:
+    """The largest rate on the way, and the angles at the end."""
+    state = released(*(line.base + x * line.direction))
+
+    def faster(rate: Scalar, time: Scalar, dt: Scalar, state: State) -> Scalar:
+        return jnp.fmax(rate, _fastest(pendulum, state))
+
+    advance = partial(_RK8.advance, pendulum)
+    end, rate = march(advance, state, jnp.exp(log_time) / steps, steps, faster, _fastest(pendulum, state))
+    return rate, jnp.stack([end.theta1, end.theta2])
+
+
+def _cover(
+    pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, turns: Array, symmetry: str
+) -> tuple[Scalar, Array]:
+    """How many times the minimal period a root's period is, and the turns at a quarter of the minimal one.
+
+    A brake orbit traversed k times is at rest after a k-th of its half period; a centred one can only be an odd multiple.
+    """
+    k = jnp.arange(2 if symmetry == "brake" else 3, _LARGEST_COVER + 1, 1 if symmetry == "brake" else 2)
+    state = released(*angles)
+    advance = partial(_RK8.advance, pendulum)
+    ends, _ = jax.vmap(lambda k: march(advance, state, jnp.exp(log_time) / (k * steps), steps, nothing, None))(k)
+    reached = jnp.round(jnp.stack([ends.theta1, ends.theta2]) / jnp.pi)
+    if symmetry == "centred":
+        missed = jnp.abs(jnp.stack([ends.theta1, ends.theta2]) - jnp.pi * reached)
+    else:
+        missed = jnp.abs(jnp.stack([ends.p1, ends.p2])) / _momentum_unit(pendulum)
+    same = jnp.max(missed, axis=0) < _SAME
+    last = k.size - 1 - jnp.argmax(same[::-1])
+    covered = jnp.any(same)
+    turns = jnp.where(covered, reached[:, last], turns) if symmetry == "centred" else turns
+    return jnp.where(covered, k[last], 1).astype(jnp.float64), turns
+
+
+# --- the friendly call -----------------------------------------------------------------------------------------------
+
+
+def find_orbit(
+    pendulum: Pendulum,
+    theta1: Scalar,
+    *,
+    branch: str | None = None,
+    guess: tuple[Scalar, Scalar] | None = None,
+    symmetry: str | None = None,
+    ratio: int | None = None,
+    crossing: int = 1,
+    turn: float = _FINE,
+    tolerance: float = 1e-13,
+    max_iterations: int = 40,
+    error: bool = True,
+) -> PeriodicOrbit:
+    """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period.
+
+    Solves theta(T/4) = 0 modulo pi (centred) or p(T/2) = 0 (brake) for (theta2, T) by damped Newton iterations whose
+    Jacobian is forward-mode through the flow. Give one of:
+
+    - `branch`: follow the family of a normal mode by arclength, turning points included, from small swings to the first
+      orbit with |theta1|. An orbit released at (-theta1, -theta2) counts: it is the same one, half a period later.
+    - `guess`: start from (theta2, period) and take what Newton's method finds, reduced to its minimal period.
+    - `ratio` alone: of the orbits with theta2 = ratio theta1 on the in-phase (+1) or anti-phase (-1) branch, or on
+      `branch`, the one nearest to `theta1`, which is then an unknown too; with `guess`, the one that its period leads to.
+
+    Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1` and the pendulum are
+    those of the root itself (implicit function theorem); with `jit`, `vmap` and `grad` all works, and what is wrong with
+    a traced argument shows in `status`.
+
+    Arguments:
+        theta1: release angle of the upper rod [rad].
+        branch: `in-phase` (slow mode) or `anti-phase` (fast mode).
+        guess: theta2 [rad], period [s].
+        symmetry: with `guess`, `centred` or `brake`. Without it the guess is solved as brake and solved again as centred if
+            the orbit is that; under tracing it stays brake, of which every centred orbit is a case.
+        ratio: +1 or -1.
+        crossing: which of the branch's passages through `theta1`, in order of arclength; the first unless told otherwise.
+        turn: how far the fastest motion may advance in one integration step [rad]. The default leaves errors near 1e-13.
+        tolerance: on the last Newton update, of theta2 [rad] relative to an amplitude below 1, and of log T. 1e-13 is
+            where rounding begins.
+        max_iterations: Newton iterations at most, at least 1, which is to evaluate the guess.
+        error: solve again at half the step for `error_estimate`; without it that is NaN.
+    Returns:
+        PeriodicOrbit. If its status is not `Status.CONVERGED` it holds the best iterate and its residual; if the branch
+        does not reach `theta1` (`NO_SUCH_ORBIT`), the orbit where it came closest to upright in theta1.
+    Raises:
+        ValueError: theta1 not finite; none or more than one of branch and guess; theta1 a multiple of pi with `branch`;
+            both angles at an equilibrium; g not positive; an unknown branch, symmetry or ratio; a period not positive.
+        RuntimeError: float64 is switched off in JAX.
+    Source: the brake-orbit conditions as in Hristov et al., arXiv:2308.16159 (three bodies); the arclength method as in
+        Peeters et al., Mechanical Systems and Signal Processing 23 (2009), section 3.
+    """
+    require_float64()
+    theta1 = number("theta1", theta1, unit="rad")
+    _check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
+    settings = {
+        "error": bool(error),
+        "turn": number("turn", turn, positive=True, unit="rad"),
+        "tolerance": number("tolerance", tolerance, positive=True),
+        "max_iterations": max_iterations,
+    }
+    theta1 = jnp.asarray(theta1, jnp.float64)
+    if guess is None:
+        slow = (branch or ("in-phase" if ratio == 1 else "anti-phase")) == "in-phase"
+        return _on_branch(pendulum, theta1, slow, crossing, ratio, **settings)
+    theta2, period = (jnp.asarray(number(n, v), jnp.float64) for n, v in zip(("theta2", "period"), guess, strict=True))
+    if ratio is None:
+        line, x = _Line(jnp.stack([theta1, 0.0]), jnp.array([0.0, 1.0])), theta2
+    else:
+        line, x = _Line(jnp.zeros(2), jnp.array([1.0, ratio])), theta1
+
+    def solve(x: Scalar, period: Scalar, symmetry: str) -> PeriodicOrbit:
+        x, log_time = lax.stop_gradient((x, jnp.log(period / _PARTS[symmetry])))
+        return _near_guess(pendulum, line, x, log_time, symmetry, **settings)
+
+    orbit = solve(x, period, symmetry or "brake")
+    if symmetry is not None or known_value(orbit.status) != Status.CONVERGED:
+        return orbit
+    centred = solve(orbit.theta2 if ratio is None else orbit.theta1, orbit.period, "centred")
+    if not _is_same(centred, orbit):
+        return orbit
+    return replace(centred, iterations=orbit.iterations + centred.iterations)
+
+
+def _check_request(  # type: ignore[no-untyped-def]
+    pendulum: Pendulum, theta1: Scalar, branch, guess, symmetry, ratio, crossing
+) -> None:
+    """Refuses what cannot be asked, as far as the values are known before tracing."""
+    if branch is not None and branch not in BRANCHES:
+        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    if symmetry is not None and symmetry not in SYMMETRIES:
+        raise ValueError(f"symmetry must be one of {', '.join(SYMMETRIES)}, got {symmetry!r}")
+    if ratio not in (None, 1, -1):
+        raise ValueError(f"ratio must be 1 or -1, got {ratio!r}")
+    if branch is not None and guess is not None:
+        raise ValueError(f"branch and guess exclude each other, got {branch!r} and {guess}: give one of them")
+    if branch is None and guess is None and ratio is None:
+        raise ValueError("branch must be given, or guess=(theta2, period), or ratio=1 or -1; got none of them")
+    if symmetry is not None and guess is None:
+        raise ValueError(f"symmetry goes with guess, got {symmetry!r} alone: orbits on a branch are centred")
+    if not isinstance(crossing, int) or crossing < 1 or (crossing > 1 and (branch is None or ratio is not None)):
+        raise ValueError(f"crossing must be an integer of at least 1, and goes with branch alone, got {crossing!r}")
+    gravity, angle1 = known_value(pendulum.g), known_value(theta1)
+    if gravity is not None and not gravity > 0:
+        raise ValueError(f"g must be positive for an orbit, got {gravity:g}: nothing swings back without gravity")
+    if guess is None:
+        if angle1 is not None and _multiple_of_pi(angle1):
+            raise ValueError(
+                f"theta1 must not be a multiple of 180 degrees on a branch, got {math.degrees(angle1):g} degrees: "
+                "the branches pass there only in equilibrium"
+            )
+        return
+    theta2, period = (known_value(number(name, value)) for name, value in zip(("theta2", "period"), guess, strict=True))
+    if period is not None and not period > 0:
+        raise ValueError(f"period must be positive [s], got {period:g}: give another guess")
+    if angle1 is not None and theta2 is not None and _multiple_of_pi(angle1) and _multiple_of_pi(theta2):
+        raise ValueError(
+            f"theta2 must not be a multiple of 180 degrees with theta1 at {math.degrees(angle1):g} degrees, "
+            f"got {math.degrees(theta2):g} degrees: that is an equilibrium"
+        )
+
+
+def _multiple_of_pi(angle: float) -> bool:
+    nearest = math.pi * round(angle / math.pi)
+    # Below 1e-100 the products of two amplitudes leave the range of float64: that is zero, too.
+    return abs(angle - nearest) <= max(4 * np.finfo(float).eps * abs(nearest), 1e-100)
+
+
+def _is_same(one: PeriodicOrbit, other: PeriodicOrbit) -> bool:
+    """Whether two converged orbits are one: angles within 1e-8 rad and periods within 1e-8 of each other."""
+    apart = max(abs(float(one.theta1 - other.theta1)), abs(float(one.theta2 - other.theta2)))
+    longer = abs(float(one.period / other.period) - 1)
+    return int(one.status) == Status.CONVERGED and max(apart, longer) < 1e-8

@@ -1,0 +1,106 @@
+"""Floquet stability of a symmetric periodic orbit from a half or a quarter of its period.
+
+A state is (theta, p); Phi(t) = [[A, B], [C, D]] is the derivative of the flow over t. The four multipliers are 1, 1 and a
+pair whose half sum is kappa: elliptic for |kappa| < 1, hyperbolic above 1, inverse hyperbolic below -1. Stability is
+read from kappa alone: the trivial pair is a Jordan block, which splits like the square root of the error.
+
+Time reversal R (theta, p) -> (theta, -p) and reflection (theta, p) -> (-theta, -p) do the rest:
+
+- brake orbit, at rest at 0 and T/2: monodromy R Phi^-1 R Phi with Phi = Phi(T/2), hence kappa = 1 + 2 tr(B^T C);
+- x(T/2) = -x(0): monodromy Phi(T/2)^2; with c = (tr(-Phi(T/2)) - 2)/2, kappa = 2 c^2 - 1 >= -1, so that such orbits
+  never double their period (Frauenfelder and Moreno, arXiv:2301.01803);
+- centred (also theta(T/4) in {0, pi}^2): Phi(T/2) = N Q^-1 N Q with Q = Phi(T/4) = [[a, b], [c', d]], N = -R, and
+  c = 1 - 2 tr(a^T d).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from dpend.pendulum import Pendulum, Scalar, State
+from dpend.steppers import Scheme
+from dpend.trajectory import march, nothing
+
+
+def transition(
+    pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar, scheme: Scheme
+) -> tuple[State, Float[Array, "4 4"]]:
+    """The state after `steps` steps of `dt` [s] and the derivative of that map, Phi[i, j] = d x_i / d x_j(0).
+
+    Rows and columns are in the order theta1, theta2, p1, p2 and in SI units.
+    """
+
+    def advance(pair: tuple[State, State], dt: Scalar) -> tuple[State, State]:
+        return scheme.advance_tangents(pendulum, *pair, dt)
+
+    (end, tangents), _ = march(advance, (state, State(*jnp.eye(4))), dt, steps, nothing, None)
+    return end, jnp.stack(jax.tree.leaves(tangents))
+
+
+def monodromy(pendulum: Pendulum, state: State, period: float, scheme: Scheme) -> Float[Array, "4 4"]:
+    """The derivative of the flow over a whole period: needs no symmetry, and is noise once kappa exceeds 1e12.
+
+    Arguments:
+        period: the time [s], known before tracing.
+    Raises:
+        ValueError: the step is longer than the period.
+    """
+    steps = scheme.steps(period)
+    return transition(pendulum, state, period / steps, steps, scheme)[1]
+
+
+def half_from_quarter(quarter: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+    """Phi(T/2) of a centred orbit from Q = Phi(T/4): N Q^-1 N Q, the inverse being the symplectic one."""
+    a, b, c, d = _blocks(quarter)
+    back = jnp.block([[d.T, b.T], [c.T, a.T]])  # N Q^-1 N
+    return back @ quarter
+
+
+def half_trace(quarter: Float[Array, "4 4"]) -> Scalar:
+    """c = (tr(-Phi(T/2)) - 2)/2 of a centred orbit from Q = Phi(T/4); kappa = 2 c^2 - 1, and c = 1 where stability ends."""
+    a, _, _, d = _blocks(quarter)
+    return 1 - 2 * jnp.sum(a * d)
+
+
+def kappa_of_centred(quarter: Float[Array, "4 4"]) -> Scalar:
+    """kappa from Phi(T/4) of a centred orbit."""
+    return 2 * half_trace(quarter) ** 2 - 1
+
+
+def kappa_of_brake(half: Float[Array, "4 4"]) -> Scalar:
+    """kappa from Phi(T/2) of a brake orbit."""
+    _, b, c, _ = _blocks(half)
+    return 1 + 2 * jnp.sum(b * c)
+
+
+def kappa_of_odd(half: Float[Array, "4 4"]) -> Scalar:
+    """kappa from Phi(T/2) of an orbit with x(T/2) = -x(0)."""
+    return 2 * ((-jnp.trace(half) - 2) / 2) ** 2 - 1
+
+
+def kappa_of_monodromy(matrix: Float[Array, "4 4"]) -> Scalar:
+    """kappa from the derivative of the flow over a whole period: (tr M - 2)/2."""
+    return (jnp.trace(matrix) - 2) / 2
+
+
+def multipliers(kappa: Scalar) -> Complex[Array, "4"]:
+    """The Floquet multipliers 1, 1, m, 1/m with m + 1/m = 2 kappa and |m| >= 1."""
+    kappa = jnp.asarray(kappa, jnp.complex128)
+    large = kappa + jnp.sqrt(kappa - 1) * jnp.sqrt(kappa + 1)  # the two principal roots never cancel against kappa
+    one = jnp.ones_like(large)
+    return jnp.stack([one, one, large, 1 / large])
+
+
+def stability_class(kappa: float) -> str:
+    """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where kappa is NaN."""
+    if kappa != kappa:
+        return "unknown"
+    if abs(kappa) == 1:
+        return "parabolic"
+    if abs(kappa) < 1:
+        return "elliptic"
+    return "hyperbolic" if kappa > 1 else "inverse hyperbolic"
+
+
+def _blocks(matrix: Float[Array, "4 4"]) -> tuple[Array, Array, Array, Array]:
+    return matrix[:2, :2], matrix[:2, 2:], matrix[2:, :2], matrix[2:, 2:]

@@ -1,0 +1,471 @@
+"""Motions in time: the end state (`flow`), anything accumulated on the way (`fold`), saved states (`simulate`), and an
+independent solution by diffrax (`reference`). Also `Status`, the one vocabulary in which results say how they went.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float
+
+from dpend._runtime import require_float64
+from dpend.pendulum import Pendulum, Scalar, State, energy_scale, hamiltonian, normal_modes, number, vector_field
+from dpend.steppers import Scheme
+
+Carry = TypeVar("Carry")
+Point = TypeVar("Point")
+
+
+class Status(IntEnum):
+    """How a computation went: an int leaf of every result. `message` gives the sentence."""
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1
+    SINGULAR = 2
+    LEFT_BRANCH = 3
+    NO_SUCH_ORBIT = 4
+    TRIVIAL_ROOT = 5
+    STEP_TOO_LARGE = 6
+    DRIFT_ABOVE_TOLERANCE = 7
+    NONFINITE = 8
+    BEYOND_HORIZON = 9
+    NOT_COMPUTED = 255
+
+
+_MESSAGES = {
+    Status.CONVERGED: "Converged.",
+    Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations; try a closer guess.",
+    Status.SINGULAR: "The equations are singular here, as at a fold of the family; try another release angle.",
+    Status.LEFT_BRANCH: "The solution is not on the branch that was followed.",
+    Status.NO_SUCH_ORBIT: "The branch does not reach this release; its largest |theta1| is returned instead.",
+    Status.TRIVIAL_ROOT: "Newton's method fell into an equilibrium or a period of zero; try another guess.",
+    Status.STEP_TOO_LARGE: "A rod turned by more than 1 rad, or the fast mode by more than 1 rad of phase, in one step; "
+    "use a smaller step.",
+    Status.DRIFT_ABOVE_TOLERANCE: "The energy drifted by more than the tolerance; use a smaller step.",
+    Status.NONFINITE: "A value is not finite.",
+    Status.BEYOND_HORIZON: "The error estimate exceeds what was asked, or 0.1 rad: the end of this motion is not to be "
+    "believed; shorten it, or use a smaller step while that still helps.",
+    Status.NOT_COMPUTED: "Not computed.",
+}
+
+
+def message(status: Scalar) -> str:
+    """The sentence that says what `status`, a value of `Status`, means."""
+    return _MESSAGES[Status(int(status))]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion at its saved times.
+
+    Attributes:
+        time: times [s], shape (n,).
+        state: the states, leaves of shape (n,).
+        energy_drift: the largest |H - H(0)| at a saved time, in units of `energy_scale`.
+        error_estimate: of the larger angle, at the worst saved time [rad]; NaN where no second pass was made.
+        steps: the number of steps taken.
+        status: a value of `Status`.
+        scheme: method and step; None for `reference`, which chooses its steps as it goes.
+    """
+
+    time: Float[Array, " n"]
+    state: State
+    energy_drift: Scalar
+    error_estimate: Scalar
+    steps: Scalar
+    status: Scalar
+    scheme: Scheme | None = field(default=None, metadata={"static": True})
+
+    def to_xarray(self) -> Any:
+        """The motion as an `xarray.Dataset` over `time`: radians and SI units, the angles in degrees as coordinates."""
+        import xarray
+
+        units = {"theta1": "rad", "theta2": "rad", "p1": "kg m^2/s", "p2": "kg m^2/s"}
+        data = {name: ("time", np.asarray(getattr(self.state, name)), {"units": unit}) for name, unit in units.items()}
+        degrees = {
+            f"{name}_deg": ("time", np.degrees(np.asarray(getattr(self.state, name))), {"units": "degree"})
+            for name in ("theta1", "theta2")
+        }
+        attributes = {
+            "energy_drift": float(self.energy_drift),
+            "error_estimate_rad": float(self.error_estimate),
+            "steps": int(self.steps),
+            "method": self.scheme.name if self.scheme else "diffrax Dopri8",
+            "status": Status(int(self.status)).name.lower(),
+        }
+        time = ("time", np.asarray(self.time), {"units": "s"})
+        return xarray.Dataset(data, {"time": time, **degrees}, attributes)
+
+
+# --- the loop over steps ---------------------------------------------------------------------------------------------
+
+# Reverse mode keeps what every step computed, some 5 kB at order 8. Beyond this many steps it keeps the states between
+# blocks of sqrt(n) steps only and computes each block again.
+_CHECKPOINT_ABOVE = 1024
+
+
+def march(
+    advance: Callable[[Point, Scalar], Point],
+    point: Point,
+    dt: Scalar,
+    steps: Scalar,
+    update: Callable[[Carry, Scalar, Scalar, Point], Carry],
+    carry: Carry,
+    first: Scalar = 0,
+) -> tuple[Point, Carry]:
+    """The loop under everything: `steps` times point = advance(point, dt), with `update` seeing each new point.
+
+    Arguments:
+        steps: an int compiles to a scan, which has both derivatives; a tracer to a loop with forward mode only.
+        first: the number of the first step, from which `update` is told the time.
+    """
+
+    def one(index: Scalar, both: tuple[Point, Carry]) -> tuple[Point, Carry]:
+        point, carry = both
+        point = advance(point, dt)
+        return point, update(carry, (index + 1) * dt, dt, point)
+
+    def run(both: tuple[Point, Carry], first: Scalar, count: Scalar) -> tuple[Point, Carry]:
+        return lax.fori_loop(0, count, lambda i, c: one(first + i, c), both)
+
+    both = (point, carry)
+    if not isinstance(steps, int) or steps <= _CHECKPOINT_ABOVE:
+        return run(both, first, steps)
+    block = math.isqrt(steps)
+    blocks, rest = divmod(steps, block)
+    again = jax.checkpoint(lambda c, i: run(c, first + i * block, block))
+    both, _ = lax.scan(lambda c, i: (again(c, i), None), both, jnp.arange(blocks))
+    return run(both, first + blocks * block, rest) if rest else both
+
+
+def nothing(carry: None, time: Scalar, dt: Scalar, point: Any) -> None:
+    """The `update` of a motion of which only the end is wanted."""
+    return None
+
+
+def _float64(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float64)), tree)
+
+
+def known_value(value: Scalar) -> float | None:
+    """The number behind `value`, also under eager differentiation; None where it is traced."""
+    try:
+        return float(lax.stop_gradient(value))
+    except jax.errors.ConcretizationTypeError:
+        return None
+
+
+def _grid(duration: Scalar, scheme: Scheme) -> tuple[Scalar, Scalar]:
+    """The number of steps (an int where the duration is known) and their size."""
+    require_float64()
+    known = known_value(number("duration", duration, unit="s"))
+    if known is not None:
+        if not math.isfinite(known):
+            raise ValueError(f"duration must be a finite number [s], got {known}: give another duration")
+        steps: Scalar = scheme.steps(known)
+    else:
+        steps = jnp.maximum(jnp.ceil(jnp.abs(duration) / scheme.step - 1e-9), 1).astype(int)
+    return steps, jnp.asarray(duration, jnp.float64) / (steps if known is None else max(steps, 1))
+
+
+def _folded(update, init, pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-def]
+    return march(lambda x, h: scheme.advance(pendulum, x, h), state, dt, steps, update, init)
+
+
+_fold = jax.jit(_folded, static_argnames=("update", "steps", "scheme"))
+_fold_traced = jax.jit(_folded, static_argnames=("update", "scheme"))
+
+
+def flow(pendulum: Pendulum, state: State, duration: Scalar, scheme: Scheme) -> State:
+    """The state after `duration`: n = ceil(duration/step - 1e-9) steps of duration/n each, no trajectory stored.
+
+    Arguments:
+        pendulum, state: leaves are scalars; `jax.vmap` maps over many.
+        duration: time [s]; negative runs backwards, zero returns the state. A number known at trace time, or a value
+            being differentiated by eager `grad`, fixes n and allows reverse mode (checkpointed beyond 1024 steps); a
+            traced one allows forward mode only.
+        scheme: method and step.
+    Raises:
+        ValueError: duration not finite, or shorter than one step.
+        RuntimeError: float64 is switched off in JAX.
+    """
+    end, _ = _accumulate(nothing, None, pendulum, state, duration, scheme)
+    return end
+
+
+def fold(
+    update: Callable[[Carry, Scalar, Scalar, State], Carry],
+    init: Carry,
+    pendulum: Pendulum,
+    state: State,
+    duration: Scalar,
+    scheme: Scheme,
+) -> Carry:
+    """Something accumulated along the motion: `init` after `update` has seen every step.
+
+    Arguments:
+        update: (carry, time, dt, state) -> carry, called after each step with the time [s] and state at its end.
+            Compiled functions are kept by its identity, so define it once, not inside a loop.
+        init: any pytree; Python numbers in it become float64.
+        pendulum, state, duration, scheme: as for `flow`.
+    Raises:
+        ValueError: duration not finite, or shorter than one step.
+        RuntimeError: float64 is switched off in JAX.
+    """
+    _, carry = _accumulate(update, init, pendulum, state, duration, scheme)
+    return carry
+
+
+def _accumulate(update, init, pendulum, state, duration, scheme):  # type: ignore[no-untyped-def]
+    steps, dt = _grid(duration, scheme)
+    compiled = _fold if isinstance(steps, int) else _fold_traced
+    return compiled(update, jax.tree.map(_weakly_float64, init), pendulum, _float64(state), dt, steps, scheme)
+
+
+def _weakly_float64(leaf: Any) -> Any:
+    return np.float64(leaf) if isinstance(leaf, float) else leaf
+
+
+# --- saved motions ---------------------------------------------------------------------------------------------------
+
+# In one step a rod may turn, and the fast mode advance, by this much [rad]: beyond it neither method resolves the
+# motion, whatever the energy says.
+_LARGEST_TURN = 1.0
+# An error of this many radians is no small error: the computed motion has parted from the true one.
+_PARTED = 0.1
+
+
+def _fastest(pendulum: Pendulum, state: State) -> Scalar:
+    """The largest angular velocity in the motion [rad/s] at this state."""
+    rates = vector_field(pendulum, state)
+    return jnp.maximum(jnp.abs(rates.theta1), jnp.abs(rates.theta2))
+
+
+def _fast_frequency(pendulum: Pendulum) -> Scalar:
+    """The fast mode's frequency [rad/s], with gravity's sign left out: also the fastest escape when it pulls upwards."""
+    return normal_modes(replace(pendulum, g=jnp.abs(pendulum.g)))[1].frequency
+
+
+def _saved(pendulum, state, dt, steps, scheme, save_every):  # type: ignore[no-untyped-def]
+    """Times and states at steps 0, save_every, 2 save_every, ..., steps, and the largest rate met on the way."""
+
+    def advance(state: State, dt: Scalar) -> State:
+        return scheme.advance(pendulum, state, dt)
+
+    def faster(rate: Scalar, time: Scalar, dt: Scalar, state: State) -> Scalar:
+        return jnp.fmax(rate, _fastest(pendulum, state))
+
+    def segment(carry, index, count):  # type: ignore[no-untyped-def]
+        state, rate = carry
+        carry = march(advance, state, dt, count, faster, rate, index)
+        # One row to save, not four: XLA would copy four arrays whole at every save.
+        return carry, jnp.stack(jax.tree.leaves(carry[0]))
+
+    full, rest = divmod(steps, save_every)
+    at = np.arange(full + 1) * save_every
+    carry = (state, _fastest(pendulum, state))
+    carry, rows = lax.scan(lambda c, i: segment(c, i, save_every), carry, jnp.asarray(at[:-1]))
+    rows = jnp.concatenate([jnp.stack(jax.tree.leaves(state))[None], rows])
+    if rest:
+        at = np.append(at, steps)
+        carry, last = segment(carry, full * save_every, rest)
+        rows = jnp.concatenate([rows, last[None]])
+    return jnp.asarray(at) * dt, State(*rows.T), carry[1]
+
+
+@partial(jax.jit, static_argnames=("steps", "scheme", "save_every", "error"))
+def _simulate(pendulum, state, duration, steps, scheme, save_every, error, wanted, drift_tolerance):  # type: ignore[no-untyped-def]
+    dt = duration / steps
+    time, states, rate = _saved(pendulum, state, dt, steps, scheme, save_every)
+    drift = _drift(pendulum, states)
+    estimate = jnp.asarray(jnp.nan)
+    if error:
+        _, finer, _ = _saved(pendulum, state, dt / 2, 2 * steps, scheme, 2 * save_every)
+        estimate = _angle_error(states, finer) / (1 - 2.0**-scheme.order)
+    finite = jax.tree.reduce(lambda ok, leaf: ok & jnp.all(jnp.isfinite(leaf)), states, jnp.asarray(True))
+    status = jnp.where(estimate > wanted, Status.BEYOND_HORIZON, Status.CONVERGED)
+    status = jnp.where(drift > drift_tolerance, Status.DRIFT_ABOVE_TOLERANCE, status)
+    status = jnp.where(finite, status, Status.NONFINITE)
+    turn = jnp.maximum(rate, _fast_frequency(pendulum)) * jnp.abs(dt)
+    status = jnp.where(turn > _LARGEST_TURN, Status.STEP_TOO_LARGE, status)
+    return Trajectory(time, states, drift, estimate, jnp.asarray(steps), status, scheme)
+
+
+def _drift(pendulum: Pendulum, states: State) -> Scalar:
+    """The largest |H - H(0)| along saved states, in units of the energy scale."""
+    energy = hamiltonian(pendulum, states)
+    start = jax.tree.map(lambda leaf: leaf[0], states)
+    return jnp.max(jnp.abs(energy - energy[0])) / energy_scale(pendulum, start)
+
+
+def _angle_error(a: State, b: State) -> Scalar:
+    """The larger difference of the two angles [rad], at the worst of the saved times."""
+    return jnp.max(jnp.maximum(jnp.abs(a.theta1 - b.theta1), jnp.abs(a.theta2 - b.theta2)))
+
+
+def simulate(
+    pendulum: Pendulum,
+    state: State,
+    duration: float,
+    *,
+    step: float | None = None,
+    method: str = "rk8",
+    tolerance: float | None = None,
+    save_every: int = 1,
+    error: bool = True,
+    drift_tolerance: float = 1e-6,
+) -> Trajectory:
+    """The motion from `state` over `duration`, with an estimate of its own error.
+
+    The estimate is Richardson's, |x_h - x_(h/2)|/(1 - 2^-p): of the returned solution, at the worst saved time, in the
+    larger angle (Hairer, Norsett and Wanner I, section II.4).
+
+    Arguments:
+        pendulum, state: leaves are scalars.
+        duration: time [s]; negative runs backwards.
+        step: largest step [s]. Without it the step is chosen for `tolerance`.
+        method: `rk4` or `rk8`; the default needs ten times fewer evaluations than `rk4` at an error of 1e-9.
+        tolerance: wanted error of the angles [rad] at the worst time; 1e-9 if neither it nor a step is given. If no step
+            reaches it, because the motion is chaotic and too long, the status is `BEYOND_HORIZON`.
+        save_every: every how many steps a state is saved; the last state always is.
+        error: make the second pass at half the step. Without it `error_estimate` is NaN, at a third of the time.
+        drift_tolerance: largest energy drift, in units of the energy scale, that passes; 1e-6 is far above what either
+            method loses at a sensible step.
+    Returns:
+        Trajectory.
+    Raises:
+        ValueError: duration zero or not finite, both step and tolerance given, a step not positive or longer than the
+            motion, an unknown method, save_every below 1.
+        RuntimeError: float64 is switched off in JAX.
+    """
+    require_float64()
+    known = known_value(number("duration", duration, unit="s"))
+    if known is None or not math.isfinite(known) or known == 0.0:
+        raise ValueError(f"duration must be a finite number [s] other than zero, known before tracing, got {duration}")
+    if step is not None and tolerance is not None:
+        raise ValueError(f"step and tolerance exclude each other, got {step} and {tolerance}: give one of them")
+    if isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
+        raise ValueError(f"save_every must be an integer of at least 1, got {save_every!r}")
+    drift_tolerance = number("drift_tolerance", drift_tolerance, positive=True)
+    state = _float64(state)
+    wanted = np.float64(_PARTED)
+    if step is None:
+        wanted = number("tolerance", 1e-9 if tolerance is None else tolerance, positive=True, unit="rad")
+        scheme = _scheme_reaching(pendulum, state, known, method, wanted)
+    else:
+        scheme = Scheme(method, step)
+    steps = scheme.steps(known)
+    every = min(int(save_every), steps)
+    return _simulate(pendulum, state, jnp.asarray(duration, jnp.float64), steps, scheme, every, error, wanted, drift_tolerance)
+
+
+# The first step that is tried when one is sought [rad of the fastest motion at the start].
+_FIRST_TURN = 0.5
+# Below (rate dt)^p of this the truncation of a step is lost in rounding: a smaller step only adds to that.
+_ONLY_ROUNDING = 1e-18
+
+
+def _scheme_reaching(pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float) -> Scheme:
+    """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding allows."""
+    rate = float(jnp.maximum(_fast_frequency(pendulum), _fastest(pendulum, state)))
+    march = Scheme(method, abs(duration))  # its step is not used: one compiled search for all steps
+    steps, before = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN)), math.inf
+    while True:
+        scheme = Scheme(method, abs(duration) / steps)
+        error = float(_error_of(pendulum, state, jnp.asarray(duration) / steps, jnp.asarray(steps), march))
+        stalled = error < 1e-3 and error > before / 2
+        if error <= tolerance or stalled or (rate * scheme.step) ** march.order < _ONLY_ROUNDING:
+            return scheme
+        missing = (2 * error / tolerance) ** (1 / march.order) if math.isfinite(error) else 4.0
+        steps, before = math.ceil(steps * min(max(missing, 1.2), 4.0)), error
+
+
+@partial(jax.jit, static_argnames="scheme")
+def _error_of(pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-def]
+    """Richardson's estimate for `steps` steps of `dt`, both traced: two motions side by side, no state saved."""
+
+    def advance(state, dt):  # type: ignore[no-untyped-def]
+        return scheme.advance(pendulum, state, dt)
+
+    def compare(carry, time, dt, coarse):  # type: ignore[no-untyped-def]
+        fine, worst = carry
+        fine, _ = march(advance, fine, dt / 2, 2, nothing, None)
+        return fine, jnp.fmax(worst, _angle_error(coarse, fine))
+
+    end, (_, worst) = march(advance, state, dt, steps, compare, (state, jnp.asarray(0.0)))
+    lost = ~jnp.isfinite(end.theta1 + end.theta2 + end.p1 + end.p2)
+    return jnp.where(lost, jnp.inf, worst / (1 - 2.0**-scheme.order))
+
+
+# --- an independent integrator ---------------------------------------------------------------------------------------
+
+
+def reference(pendulum: Pendulum, state: State, times: ArrayLike, *, tolerance: float = 1e-13, error: bool = True) -> Trajectory:
+    """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's integrators.
+
+    It takes as many steps as it needs. The error estimate is the change when the tolerance is ten times larger.
+
+    Arguments:
+        pendulum, state: leaves are scalars; `state` holds at t = 0.
+        times: increasing from zero or more, or decreasing from zero or less [s], shape (n,).
+        tolerance: relative and absolute, of angles [rad] and of momenta in units of the motion's own inertia and rate;
+            1e-13 is the least that rounding leaves room for.
+        error: make the second solution. Without it `error_estimate` is NaN.
+    Returns:
+        Trajectory, its `steps` those of the better solution; status `NONFINITE` where diffrax gave up.
+    Raises:
+        ValueError: times empty, not finite, not monotonic or on both sides of zero; tolerance not positive.
+        RuntimeError: float64 is switched off in JAX.
+    """
+    require_float64()
+    tolerance = number("tolerance", tolerance, positive=True)
+    grid = np.atleast_1d(np.asarray(times, np.float64))
+    moves = np.diff(grid, prepend=0.0)
+    ordered = np.all(moves[1:] > 0) and grid[0] >= 0 if grid.size and grid[-1] > 0 else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
+    if grid.ndim != 1 or not grid.size or not np.all(np.isfinite(grid)) or not ordered:
+        raise ValueError(f"times must be finite and move away from zero in one direction, got {np.asarray(times)}: sort them")
+    state = _float64(state)
+    states, steps, done = _dopri8(pendulum, state, jnp.asarray(grid), tolerance)
+    estimate = jnp.asarray(jnp.nan)
+    if error:
+        estimate = _angle_error(states, _dopri8(pendulum, state, jnp.asarray(grid), 10 * tolerance)[0])
+    with_start = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), state, states)
+    status = jnp.where(done, Status.CONVERGED, Status.NONFINITE)
+    return Trajectory(jnp.asarray(grid), states, _drift(pendulum, with_start), estimate, steps, status)
+
+
+@jax.jit
+def _dopri8(pendulum, state, times, tolerance):  # type: ignore[no-untyped-def]
+    """States at `times`, steps taken, and whether diffrax succeeded."""
+    import diffrax
+
+    rate = jnp.maximum(_fast_frequency(pendulum), _fastest(pendulum, state))
+    unit = State(1.0, 1.0, (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * rate, pendulum.m2 * pendulum.l2**2 * rate)
+
+    def slope(time, scaled, pendulum):  # type: ignore[no-untyped-def]
+        return jax.tree.map(jnp.divide, vector_field(pendulum, jax.tree.map(jnp.multiply, scaled, unit)), unit)
+
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(slope),
+        diffrax.Dopri8(),
+        t0=0.0,
+        t1=times[-1],
+        dt0=None,
+        y0=jax.tree.map(jnp.divide, state, unit),
+        args=pendulum,
+        saveat=diffrax.SaveAt(ts=times),
+        # Without a least step a state that is not finite would be retried for ever.
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, dtmin=1e-12 / rate),
+        max_steps=None,
+        throw=False,
+    )
+    states = jax.tree.map(jnp.multiply, solution.ys, unit)
+    return states, solution.stats["num_steps"], solution.result == diffrax.RESULTS.successful
