@@ -138,6 +138,7 @@ def _fastest(pendulum: Pendulum, state: State) -> Scalar:
     return jnp.sqrt(_clock(pendulum) ** 2 + spin)
 
 
+@partial(jax.jit, static_argnames="symmetry")  # traced once for the walk and for Newton's method
 def _shoot(
     pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, symmetry: str, turns: Array
 ) -> _Shot:
@@ -239,7 +240,8 @@ def _newton(
             status=status,
         )
 
-    blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan), jax.eval_shape(shoot, x, log_time))
+    nan = jnp.asarray(jnp.nan)
+    blank = _Shot(jnp.full(2, nan), jnp.full((2, 3), nan), jnp.full((4, 4), nan), State(nan, nan, nan, nan), nan)
     start = _Newton(
         x, log_time, jnp.asarray(jnp.inf), blank, jnp.zeros(2), jnp.asarray(1.0), jnp.asarray(0), jnp.asarray(_RUNNING)
     )
@@ -257,10 +259,18 @@ _SHORTEST = 0.02
 
 # Arclength steps in (theta1, theta2, log time) [rad]: the first is where the normal mode is still true to 1e-4, the
 # longest turns by less than the angle below on the families of twenty pendulums that were tried.
-_FIRST_STEP, _LONGEST_STEP, _SHORTEST_STEP = 0.02, 0.5, 1e-8
+_FIRST_STEP, _LONGEST_STEP = 0.02, 0.5
 # A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of the step's length).
 _LEAST_COSINE, _LARGEST_MISS, _WANTED_MISS = 0.95, 0.1, 0.02
-_MOST_POINTS = 1500
+# Newton's second update over its first (Deuflhard, Newton Methods for Nonlinear Problems, section 5.1).
+_LARGEST_CONTRACTION = 0.05
+_MOST_POINTS = 600
+# Where steps must be shorter than this, the integration is as fine as for the digits: its error, grown by the condition of
+# the equations, is what the walk would stumble over.
+_CAREFUL = 0.015
+# Two curves that pass each other closer than this [rad] count as crossing, and the walk goes straight on by one of these.
+_CROSSING = 1e-4
+_LEAPS = np.array([1e-3, 1e-2])
 _WALK_TOLERANCE = 1e-6
 # Closer than this to the upright state [rad] the branch counts as ended in its homoclinic limit.
 _UPRIGHT = 1e-4
@@ -271,11 +281,22 @@ _PIECES = 16
 
 
 class _Corrected(NamedTuple):
-    """A point of a family with its unit tangent; the rate met on the orbit; how many iterations, and whether enough."""
+    """A point of a family.
+
+    Attributes:
+        point, tangent: where it is, and the unit tangent, which goes on in the old one's direction.
+        side: the sign with which the Jacobian's cross product had to be taken for that. It is constant along a curve, and
+            changes on a jump across the gap to another one that runs close by.
+        rate: the largest one met on the orbit [rad/s].
+        contraction: the second Newton update over the first: small where the prediction was in reach of this curve alone.
+        iterations, converged: of Newton's method.
+    """
 
     point: Float[Array, "3"]
     tangent: Float[Array, "3"]
+    side: Scalar
     rate: Scalar
+    contraction: Scalar
     iterations: Scalar
     converged: Scalar
 
@@ -290,23 +311,27 @@ def _corrected(
     """
 
     def iterate(carry: tuple) -> tuple:
-        point, _, _, _, count = carry
+        point, _, _, size, ratio, count = carry
         shot = _shoot(pendulum, point[:2], point[2], steps, symmetry, turns)
         one, two = shot.jacobian
         null = jnp.cross(one, two)
         columns = jnp.stack([jnp.cross(two, tangent), jnp.cross(tangent, one), null])
         short = jnp.append(shot.value, tangent @ (point - predicted))
         update = -(short @ columns) / (null @ tangent)
-        return point + update, null, shot.rate, jnp.max(jnp.abs(update)), count + 1
+        new_size = jnp.max(jnp.abs(update))
+        ratio = jnp.where(count == 1, new_size / size, ratio)
+        return point + update, null, shot.rate, new_size, ratio, count + 1
 
     def unfinished(carry: tuple) -> Scalar:
-        _, _, _, size, count = carry
-        return (count == 0) | ((size > tolerance) & (size < 1.0) & (count < 6))
+        _, _, _, size, ratio, count = carry
+        return (count == 0) | ((size > tolerance) & (size < 1.0) & (ratio < 1.0) & (count < 6))
 
-    start = (predicted, tangent, jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0))
-    point, null, rate, size, count = lax.while_loop(unfinished, iterate, start)
+    zero = jnp.asarray(0.0)
+    start = (predicted, tangent, zero, zero, zero, jnp.asarray(0))
+    point, null, rate, size, ratio, count = lax.while_loop(unfinished, iterate, start)
     new = null / jnp.linalg.norm(null)
-    return _Corrected(point, jnp.where(new @ tangent < 0, -new, new), rate, count, size <= tolerance)
+    side = jnp.where(new @ tangent < 0, -1.0, 1.0)
+    return _Corrected(point, side * new, side, rate, ratio, count, size <= tolerance)
 
 
 class _Piece(NamedTuple):
@@ -331,7 +356,9 @@ class _Piece(NamedTuple):
 
 class _Walk(NamedTuple):
     piece: _Piece
+    side: Scalar
     step: Scalar
+    leaps: Scalar
     rate: Scalar
     iterations: Scalar
     points: Scalar
@@ -364,33 +391,41 @@ def _walk(pendulum: Pendulum, mode: Any, target: Scalar, crossing: Scalar, ratio
         # Without a step behind it the cubic has length zero: then the tangent alone predicts.
         along = jnp.where(w.points > 0, 1 + w.step / jnp.where(w.points > 0, piece.length, 1.0), 1.0)
         predicted = jnp.where(w.points > 0, piece.at(along), piece.end + w.step * tangent)
-        steps = _steps_for(predicted[2], w.rate, _COARSE)
+        turn = jnp.where(w.step < _CAREFUL, _FINE, _COARSE)
+        steps = _steps_for(predicted[2], w.rate, turn)
         new = _corrected(pendulum, predicted, tangent, steps, turns, "centred", _WALK_TOLERANCE)
         miss = jnp.max(jnp.abs(new.point - predicted)) / w.step
-        resolved = _steps_for(new.point[2], new.rate, _COARSE) <= 1.5 * steps
-        good = new.converged & (new.tangent @ tangent >= _LEAST_COSINE) & (miss <= _LARGEST_MISS)
+        resolved = _steps_for(new.point[2], new.rate, turn) <= 1.5 * steps
+        smooth = (new.side == w.side) | (w.points == 0) | (w.leaps > 0)
+        smooth &= (new.contraction <= _LARGEST_CONTRACTION) | (w.leaps > 0)
+        good = new.converged & smooth & (new.tangent @ tangent >= _LEAST_COSINE) & (miss <= _LARGEST_MISS)
         length = jnp.linalg.norm(new.point - piece.end)
         taken = _Piece(piece.end, tangent, new.point, new.tangent, length)
         growth = jnp.clip((_WANTED_MISS / jnp.fmax(miss, 1e-9)) ** 0.25, 0.5, 2.0)
         held = jnp.where(good | ~new.converged, w.rate, jnp.fmax(w.rate, new.rate))
         after = w._replace(
             piece=taken,
+            side=new.side,
             step=jnp.minimum(w.step * growth, _LONGEST_STEP),
+            leaps=jnp.asarray(0),
             rate=new.rate,
             iterations=new.iterations,
             points=w.points + 1,
             reach=jnp.where(jnp.abs(new.point[0]) > jnp.abs(w.reach[0]), new.point, w.reach),
         )
         after = _looked_at(after, wanted, target, crossing, ratio, origin)
-        back = w._replace(step=jnp.where(good, w.step, w.step / 2), rate=jnp.where(good, new.rate, held))
+        # Where even the shortest step is refused, the curve all but meets another: straight on, over the place.
+        leaps = jnp.where(good, w.leaps, w.leaps + ((w.leaps > 0) | (w.step < 2 * _CROSSING)))
+        shorter = jnp.where(leaps > 0, jnp.asarray(_LEAPS)[jnp.minimum(leaps, len(_LEAPS)) - 1], w.step / 2)
+        back = w._replace(step=jnp.where(good, w.step, shorter), rate=jnp.where(good, new.rate, held), leaps=leaps)
         chosen = jax.tree.map(partial(jnp.where, good & resolved), after, back)
-        gave_up = (chosen.step < _SHORTEST_STEP) | (chosen.points >= _MOST_POINTS) | (w.attempts >= 3 * _MOST_POINTS)
-        status = jnp.where((chosen.status == _RUNNING) & gave_up, Status.MAX_ITERATIONS, chosen.status)
+        gave_up = (leaps > len(_LEAPS)) | (chosen.points >= _MOST_POINTS) | (w.attempts >= 3 * _MOST_POINTS)
+        status = jnp.where((chosen.status == _RUNNING) & gave_up, Status.LEFT_BRANCH, chosen.status)
         return chosen._replace(attempts=w.attempts + 1, status=status)
 
     zero = jnp.asarray(0)
     start = _Walk(
-        _Piece(origin, slope, origin, slope, jnp.asarray(0.0)), jnp.asarray(_FIRST_STEP), _clock(pendulum),
+        _Piece(origin, slope, origin, slope, jnp.asarray(0.0)), jnp.asarray(0.0), jnp.asarray(_FIRST_STEP), zero, _clock(pendulum),
         zero, zero, zero, zero, origin, origin, jnp.asarray(False), jnp.asarray(False), jnp.asarray(_RUNNING),
     )  # fmt: skip
     return lax.while_loop(lambda w: w.status == _RUNNING, advance, start)
