@@ -61,7 +61,7 @@ def _extended_flags(flags: str) -> str:
 
 
 def _add_compile_options() -> None:
-    """Has XLA parse its options with ours among them, then puts `XLA_FLAGS` back, so that children do not inherit it."""
+    """Has XLA parse its options with ours among them, then restores `XLA_FLAGS`, which child processes inherit."""
     before = os.environ.get("XLA_FLAGS")
     os.environ["XLA_FLAGS"] = _extended_flags(before or "")
     try:
@@ -85,7 +85,7 @@ def configure() -> None:
     """Sets JAX up for this package, unless it runs already or `DPEND_PLAIN_JAX=1` asks to leave it alone."""
     if os.environ.get(PLAIN, "") not in ("", "0"):
         return
-    devices = jax.config.jax_num_cpu_devices
+    devices = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
     forced = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     wanted = _cores() if devices < 0 and not forced else devices
     try:
@@ -104,7 +104,7 @@ def require_float64() -> None:
     Raises:
         RuntimeError: `jax_enable_x64` is off.
     """
-    if not jax.config.jax_enable_x64:
+    if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise RuntimeError(
             "float64 is off in JAX, and dpend's digits need it: import dpend before JAX runs anything, "
             'or call jax.config.update("jax_enable_x64", True), or set JAX_ENABLE_X64=1'

@@ -232,7 +232,8 @@ def _described(pendulum: Pendulum) -> str:
 
 def _print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) -> None:
     final = record["final"]
-    print(f"after {record['duration_s']:g} s   theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg")
+    angles = f"theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg"
+    print(f"after {record['duration_s']:g} s   {angles}")
     print(f"                p1 = {final['p1']:.12g}, p2 = {final['p2']:.12g} kg m^2/s")
     print(f"error estimate  {record['error_estimate']:.1e} rad, energy drift {record['energy_drift']:.1e} of its scale")
     print(f"integrated by   {record['method']}, {record['steps']} steps of {record['step_s']:.4g} s")
@@ -285,8 +286,8 @@ def _write_netcdf(motion: Trajectory, path: Path) -> None:
 
 
 def _keep_compiled_code() -> None:
-    """Points JAX's compilation cache at the user's cache directory, unless the user has chosen: later runs start warm."""
-    if jax.config.jax_compilation_cache_dir is not None:
+    """Has JAX keep compiled code in the user's cache directory, or where the user chose: later runs start warm."""
+    if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         return
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dpend"
     try:

@@ -267,7 +267,7 @@ def normal_modes(pendulum: Pendulum) -> tuple[NormalMode, NormalMode]:
     Raises:
         ValueError: g is a number that is not positive: nothing swings.
     """
-    if isinstance(pendulum.g, Real) and not pendulum.g > 0:
+    if isinstance(pendulum.g, np.floating) and not pendulum.g > 0:
         raise ValueError(f"g must be positive for normal modes, got {pendulum.g}: nothing swings without gravity")
     l1, l2 = pendulum.l1, pendulum.l2
     share = pendulum.m2 / (pendulum.m1 + pendulum.m2)

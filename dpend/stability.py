@@ -1,7 +1,7 @@
 """Floquet stability of a symmetric periodic orbit from a half or a quarter of its period.
 
-A state is (theta, p); Phi(t) = [[A, B], [C, D]] is the derivative of the flow over t. The four multipliers are 1, 1 and a
-pair whose half sum is kappa: elliptic for |kappa| < 1, hyperbolic above 1, inverse hyperbolic below -1. Stability is
+A state is (theta, p); Phi(t) = [[A, B], [C, D]] is the derivative of the flow over t. The four multipliers are 1, 1 and
+a pair whose half sum is kappa: elliptic for |kappa| < 1, hyperbolic above 1, inverse hyperbolic below -1. Stability is
 read from kappa alone: the trivial pair is a Jordan block, which splits like the square root of the error.
 
 Time reversal R (theta, p) -> (theta, -p) and reflection (theta, p) -> (-theta, -p) do the rest:
@@ -19,7 +19,7 @@ from jaxtyping import Array, Complex, Float
 
 from dpend.pendulum import Pendulum, Scalar, State
 from dpend.steppers import Scheme
-from dpend.trajectory import march, nothing
+from dpend.trajectory import march, nothing, step_size
 
 
 def transition(
@@ -46,7 +46,7 @@ def monodromy(pendulum: Pendulum, state: State, period: float, scheme: Scheme) -
         ValueError: the step is longer than the period.
     """
     steps = scheme.steps(period)
-    return transition(pendulum, state, period / steps, steps, scheme)[1]
+    return transition(pendulum, state, step_size(period, steps), steps, scheme)[1]
 
 
 def half_from_quarter(quarter: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
@@ -57,7 +57,7 @@ def half_from_quarter(quarter: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
 
 
 def half_trace(quarter: Float[Array, "4 4"]) -> Scalar:
-    """c = (tr(-Phi(T/2)) - 2)/2 of a centred orbit from Q = Phi(T/4); kappa = 2 c^2 - 1, and c = 1 where stability ends."""
+    """c = (tr(-Phi(T/2)) - 2)/2 of a centred orbit from Q = Phi(T/4); kappa = 2 c^2 - 1, stability ends at c = 1."""
     a, _, _, d = _blocks(quarter)
     return 1 - 2 * jnp.sum(a * d)
 

@@ -31,6 +31,7 @@ RK4 = Tableau(
 
 # The 12-stage propagator of DOP853: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed.),
 # section II.5 (coefficients in the authors' program dop853.f), without its error estimators.
+# fmt: off
 RK8 = Tableau(
     a=(
         (),
@@ -55,9 +56,10 @@ RK8 = Tableau(
          0.3111643669578199, -0.1521609496625161, 0.20136540080403034, 0.04471061572777259),
     order=8,
 )
+# fmt: on
 
-# Up to this many stages are written out, the zeros of the tableau left out with them. Beyond it the stages run as a loop:
-# order 8 written out takes XLA six times as long to compile and runs 1.3 times as fast for one trajectory.
+# Up to this many stages are written out, the zeros of the tableau left out with them. Beyond it the stages run as a
+# loop: order 8 written out takes XLA six times as long to compile and runs 1.3 times as fast for one trajectory.
 _WRITTEN_OUT = 4
 
 
@@ -151,6 +153,7 @@ class Scheme:
         count = abs(duration) / self.step
         if 0.0 < count < 1.0 - 1e-9:
             raise ValueError(
-                f"step must not be longer than the motion of {abs(duration):g} s, got {self.step:g}: give a smaller step"
+                f"step must not be longer than the motion of {abs(duration):g} s, got {self.step:g}: "
+                "give a smaller step"
             )
         return math.ceil(count - 1e-9)

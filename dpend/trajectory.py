@@ -3,7 +3,7 @@ independent solution by diffrax (`reference`). Also `Status`, the one vocabulary
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike
 
 from dpend._runtime import require_float64
 from dpend.pendulum import Pendulum, Scalar, State, energy_scale, hamiltonian, normal_modes, number, vector_field
 from dpend.steppers import Scheme
+from dpend.trig import LARGEST_ANGLE
 
 Carry = TypeVar("Carry")
 Point = TypeVar("Point")
@@ -43,12 +44,12 @@ _MESSAGES = {
     Status.CONVERGED: "Converged.",
     Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations; try a closer guess.",
     Status.SINGULAR: "The equations are singular here, as at a fold of the family; try another release angle.",
-    Status.LEFT_BRANCH: "The branch could not be followed to this release: the motion there is too sensitive for shooting "
-    "over a quarter period; its largest |theta1| so far is returned.",
+    Status.LEFT_BRANCH: "The branch could not be followed to this release: the motion there is too sensitive for "
+    "shooting over a quarter period; its largest |theta1| so far is returned.",
     Status.NO_SUCH_ORBIT: "The branch ends without reaching this release; its largest |theta1| is returned.",
     Status.TRIVIAL_ROOT: "Newton's method fell into an equilibrium or a period of zero; try another guess.",
-    Status.STEP_TOO_LARGE: "A rod turned by more than 1 rad, or the fast mode by more than 1 rad of phase, in one step; "
-    "use a smaller step.",
+    Status.STEP_TOO_LARGE: "In one step a rod turned, or the fast mode advanced, by more than 1 rad; use a smaller "
+    "step.",
     Status.DRIFT_ABOVE_TOLERANCE: "The energy drifted by more than the tolerance; use a smaller step.",
     Status.NONFINITE: "A value is not finite.",
     Status.BEYOND_HORIZON: "The error estimate exceeds what was asked, or 0.1 rad: the end of this motion is not to be "
@@ -77,7 +78,7 @@ class Trajectory:
         scheme: method and step; None for `reference`, which chooses its steps as it goes.
     """
 
-    time: Float[Array, " n"]
+    time: Scalar
     state: State
     energy_drift: Scalar
     error_estimate: Scalar
@@ -132,7 +133,7 @@ def march(
     def one(index: Scalar, both: tuple[Point, Carry]) -> tuple[Point, Carry]:
         point, carry = both
         point = advance(point, dt)
-        return point, update(carry, (index + 1) * dt, dt, point)
+        return point, update(carry, jnp.asarray(index + 1, jnp.float64) * dt, dt, point)
 
     def run(both: tuple[Point, Carry], first: Scalar, count: Scalar) -> tuple[Point, Carry]:
         return lax.fori_loop(0, count, lambda i, c: one(first + i, c), both)
@@ -145,6 +146,11 @@ def march(
     again = jax.checkpoint(lambda c, i: run(c, first + i * block, block))
     both, _ = lax.scan(lambda c, i: (again(c, i), None), both, jnp.arange(blocks))
     return run(both, first + blocks * block, rest) if rest else both
+
+
+def step_size(duration: Scalar, steps: Scalar) -> Scalar:
+    """duration/steps [s], for counts that may be traced."""
+    return duration / jnp.asarray(steps, jnp.float64)
 
 
 def nothing(carry: None, time: Scalar, dt: Scalar, point: Any) -> None:
@@ -174,7 +180,7 @@ def _grid(duration: Scalar, scheme: Scheme) -> tuple[Scalar, Scalar]:
         steps: Scalar = scheme.steps(known)
     else:
         steps = jnp.maximum(jnp.ceil(jnp.abs(duration) / scheme.step - 1e-9), 1).astype(int)
-    return steps, jnp.asarray(duration, jnp.float64) / (steps if known is None else max(steps, 1))
+    return steps, step_size(jnp.asarray(duration, jnp.float64), steps if known is None else max(steps, 1))
 
 
 def _folded(update, init, pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-def]
@@ -251,7 +257,7 @@ def _fastest(pendulum: Pendulum, state: State) -> Scalar:
 
 
 def _fast_frequency(pendulum: Pendulum) -> Scalar:
-    """The fast mode's frequency [rad/s], with gravity's sign left out: also the fastest escape when it pulls upwards."""
+    """The fast mode's frequency [rad/s] for |g|: where gravity pulls upwards, the fastest escape."""
     return normal_modes(replace(pendulum, g=jnp.abs(pendulum.g)))[1].frequency
 
 
@@ -279,12 +285,12 @@ def _saved(pendulum, state, dt, steps, scheme, save_every):  # type: ignore[no-u
         at = np.append(at, steps)
         carry, last = segment(carry, full * save_every, rest)
         rows = jnp.concatenate([rows, last[None]])
-    return jnp.asarray(at) * dt, State(*rows.T), carry[1]
+    return jnp.asarray(at, jnp.float64) * dt, State(*rows.T), carry[1]
 
 
 @partial(jax.jit, static_argnames=("steps", "scheme", "save_every", "error"))
 def _simulate(pendulum, state, duration, steps, scheme, save_every, error, wanted, drift_tolerance):  # type: ignore[no-untyped-def]
-    dt = duration / steps
+    dt = step_size(duration, steps)
     time, states, rate = _saved(pendulum, state, dt, steps, scheme, save_every)
     drift = _drift(pendulum, states)
     estimate = jnp.asarray(jnp.nan)
@@ -334,8 +340,8 @@ def simulate(
         duration: time [s]; negative runs backwards.
         step: largest step [s]. Without it the step is chosen for `tolerance`.
         method: `rk4` or `rk8`; the default needs ten times fewer evaluations than `rk4` at an error of 1e-9.
-        tolerance: wanted error of the angles [rad] at the worst time; 1e-9 if neither it nor a step is given. If no step
-            reaches it, because the motion is chaotic and too long, the status is `BEYOND_HORIZON`.
+        tolerance: wanted error of the angles [rad] at the worst time; 1e-9 if neither it nor a step is given. If no
+            step reaches it, because the motion is chaotic and too long, the status is `BEYOND_HORIZON`.
         save_every: every how many steps a state is saved; the last state always is.
         error: make the second pass at half the step. Without it `error_estimate` is NaN, at a third of the time.
         drift_tolerance: largest energy drift, in units of the energy scale, that passes; 1e-6 is far above what either
@@ -365,7 +371,9 @@ def simulate(
         scheme = Scheme(method, step)
     steps = scheme.steps(known)
     every = min(int(save_every), steps)
-    return _simulate(pendulum, state, jnp.asarray(duration, jnp.float64), steps, scheme, every, error, wanted, drift_tolerance)
+    return _simulate(
+        pendulum, state, jnp.asarray(duration, jnp.float64), steps, scheme, every, error, wanted, drift_tolerance
+    )
 
 
 # The first step that is tried when one is sought [rad of the fastest motion at the start].
@@ -381,7 +389,7 @@ def _scheme_reaching(pendulum: Pendulum, state: State, duration: float, method: 
     steps, before = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN)), math.inf
     while True:
         scheme = Scheme(method, abs(duration) / steps)
-        error = float(_error_of(pendulum, state, jnp.asarray(duration) / steps, jnp.asarray(steps), march))
+        error = float(_error_of(pendulum, state, step_size(duration, steps), jnp.asarray(steps), march))
         stalled = error < 1e-3 and error > before / 2
         if error <= tolerance or stalled or (rate * scheme.step) ** march.order < _ONLY_ROUNDING:
             return scheme
@@ -409,7 +417,9 @@ def _error_of(pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-de
 # --- an independent integrator ---------------------------------------------------------------------------------------
 
 
-def reference(pendulum: Pendulum, state: State, times: ArrayLike, *, tolerance: float = 1e-13, error: bool = True) -> Trajectory:
+def reference(
+    pendulum: Pendulum, state: State, times: ArrayLike | Sequence[float], *, tolerance: float = 1e-13, error: bool = True
+) -> Trajectory:
     """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's integrators.
 
     It takes as many steps as it needs. The error estimate is the change when the tolerance is ten times larger.
@@ -430,9 +440,15 @@ def reference(pendulum: Pendulum, state: State, times: ArrayLike, *, tolerance: 
     tolerance = number("tolerance", tolerance, positive=True)
     grid = np.atleast_1d(np.asarray(times, np.float64))
     moves = np.diff(grid, prepend=0.0)
-    ordered = np.all(moves[1:] > 0) and grid[0] >= 0 if grid.size and grid[-1] > 0 else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
+    ordered = (
+        np.all(moves[1:] > 0) and grid[0] >= 0
+        if grid.size and grid[-1] > 0
+        else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
+    )
     if grid.ndim != 1 or not grid.size or not np.all(np.isfinite(grid)) or not ordered:
-        raise ValueError(f"times must be finite and move away from zero in one direction, got {np.asarray(times)}: sort them")
+        raise ValueError(
+            f"times must be finite and move away from zero in one direction, got {np.asarray(times)}: sort them"
+        )
     state = _float64(state)
     states, steps, done = _dopri8(pendulum, state, jnp.asarray(grid), tolerance)
     estimate = jnp.asarray(jnp.nan)
@@ -448,11 +464,17 @@ def _dopri8(pendulum, state, times, tolerance):  # type: ignore[no-untyped-def]
     """States at `times`, steps taken, and whether diffrax succeeded."""
     import diffrax
 
-    rate = jnp.maximum(_fast_frequency(pendulum), _fastest(pendulum, state))
+    rate = jnp.fmax(_fast_frequency(pendulum), _fastest(pendulum, state))
     unit = State(1.0, 1.0, (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * rate, pendulum.m2 * pendulum.l2**2 * rate)
 
     def slope(time, scaled, pendulum):  # type: ignore[no-untyped-def]
-        return jax.tree.map(jnp.divide, vector_field(pendulum, jax.tree.map(jnp.multiply, scaled, unit)), unit)
+        here = jax.tree.map(jnp.multiply, scaled, unit)
+        slopes = jax.tree.map(jnp.divide, vector_field(pendulum, here), unit)
+        # A slope that is not a number would have its step retried for ever: stand still there, and say so at the end.
+        return jax.tree.map(lambda leaf: jnp.where(_in_reach(here), leaf, 0.0), slopes)
+
+    sound = _in_reach(state)
+    start = jax.tree.map(lambda leaf: jnp.where(sound, leaf, 0.0), state)
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(slope),
@@ -460,13 +482,20 @@ def _dopri8(pendulum, state, times, tolerance):  # type: ignore[no-untyped-def]
         t0=0.0,
         t1=times[-1],
         dt0=None,
-        y0=jax.tree.map(jnp.divide, state, unit),
+        y0=jax.tree.map(jnp.divide, start, unit),
         args=pendulum,
         saveat=diffrax.SaveAt(ts=times),
-        # Without a least step a state that is not finite would be retried for ever.
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, dtmin=1e-12 / rate),
         max_steps=None,
         throw=False,
     )
     states = jax.tree.map(jnp.multiply, solution.ys, unit)
-    return states, solution.stats["num_steps"], solution.result == diffrax.RESULTS.successful
+    sound &= jnp.all(_in_reach(states))
+    states = jax.tree.map(lambda leaf: jnp.where(sound, leaf, jnp.nan), states)
+    return states, solution.stats["num_steps"], sound & (solution.result == diffrax.RESULTS.successful)
+
+
+def _in_reach(state: State) -> Scalar:
+    """Whether the vector field can be computed here: finite, and angles that sine and cosine can reduce."""
+    angles = jnp.maximum(jnp.abs(state.theta1), jnp.abs(state.theta2))
+    return (angles <= LARGEST_ANGLE) & jnp.isfinite(state.p1) & jnp.isfinite(state.p2)

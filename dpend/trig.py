@@ -70,8 +70,8 @@ def _sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Ar
     high, middle, low = (turns * piece for piece in _PI_2)  # exact products
     rough = (x - high) - middle
     r = rough - low
-    # What the last subtraction rounded away, exactly (Dekker's fast two-sum), less what three pieces leave out. It joins
-    # the small term of the sine, so that only one rounding of the argument reaches the result.
+    # What the last subtraction rounded away, exactly (Dekker's fast two-sum), less what three pieces leave out. It
+    # joins the small term of the sine, so that only one rounding of the argument reaches the result.
     correction = ((rough - r) - low) - turns * _PI_2_REST
     z = r * r
     sin_r = r + (r * z * _polynomial(_SIN, z) + correction)

@@ -1,6 +1,6 @@
 """The picture at the top of the README: both orbits released from rest at theta1 = 40 deg.
 
-    python experiments/orbit_sheet.py [--quick] [--out FILE.png]
+python experiments/orbit_sheet.py [--quick] [--out FILE.png]
 """
 
 import argparse

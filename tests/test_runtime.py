@@ -1,0 +1,85 @@
+"""What importing dpend does to JAX, seen from fresh processes."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dpend import _runtime
+
+
+def run(code, **environment):
+    """The JSON that `code` prints, in a fresh interpreter whose JAX variables are those given."""
+    clean = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_", "DPEND_"))}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, env=clean | environment
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+REPORT = """
+import json, os, jax
+import dpend
+x64, devices = jax.config.jax_enable_x64, len(jax.devices("cpu"))
+try:
+    dpend.Pendulum()
+    error = None
+except RuntimeError as refused:
+    error = str(refused)
+print(json.dumps([x64, devices, os.environ.get("XLA_FLAGS"), error]))
+"""
+
+
+def test_import_sets_up_float64_and_a_device_a_core():
+    assert run(REPORT) == [True, _runtime._cores(), None, None]
+
+
+def test_plain_jax_is_left_alone():
+    x64, devices, flags, error = run(REPORT, DPEND_PLAIN_JAX="1")
+    assert (x64, devices, flags) == (False, 1, None)
+    assert "float64 is off" in error
+    assert run(REPORT, DPEND_PLAIN_JAX="1", JAX_ENABLE_X64="1") == [True, 1, None, None]
+
+
+def test_a_running_jax_is_left_alone():
+    x64, devices, _, error = run("import jax; jax.numpy.zeros(1).block_until_ready()" + REPORT)
+    assert (x64, devices) == (False, 1)
+    assert "import dpend before JAX" in error
+
+
+def test_the_users_own_settings_stand():
+    flags = "--xla_cpu_enable_fast_min_max=false"
+    assert run(REPORT, JAX_NUM_CPU_DEVICES="3", XLA_FLAGS=flags) == [True, 3, flags, None]
+    x64, *_, error = run(REPORT, JAX_ENABLE_X64="0")
+    assert x64 is False
+    assert "float64 is off" in error
+
+
+def test_options_are_added_only_where_the_user_is_silent():
+    mine = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=false"
+    together = _runtime._extended_flags(mine)
+    assert together.startswith(mine)
+    assert together.count("xla_cpu_use_multi_output_fusion") == 1
+
+
+def test_unknown_options_are_found_out():
+    assert _runtime._known_to_xla("xla_backend_extra_options")
+    assert not _runtime._known_to_xla("xla_cpu_no_such_option_as_this")
+
+
+@pytest.mark.slow
+def test_results_agree_to_rounding_with_and_without_the_options():
+    code = """
+import json, numpy as np
+import dpend
+paper = dpend.Pendulum()
+orbits = [dpend.find_orbit(paper, np.radians(40.0), branch=b) for b in ("in-phase", "anti-phase")]
+end = dpend.flow(paper, dpend.released(2.0, 1.0), 2.0, dpend.Scheme("rk8", 5e-3))
+print(json.dumps([[float(o.theta2), float(o.period)] for o in orbits] + [[float(end.theta1), float(end.theta2)]]))
+"""
+    with_options, without = run(code), run(code, DPEND_PLAIN_JAX="1", JAX_ENABLE_X64="1")
+    np.testing.assert_allclose(with_options, without, rtol=1e-12)

@@ -1,0 +1,80 @@
+"""Each step against its order, an independent loop and the definition of a tangent."""
+
+import jax
+import numpy as np
+import pytest
+
+import dpend
+from dpend import Scheme, State
+
+STATE = State(1.0, -0.7, 0.01, 0.004)
+
+
+@pytest.mark.parametrize(("name", "order", "steps"), [("rk4", 4, (100, 200, 400)), ("rk8", 8, (20, 24, 32))])
+def test_order(paper, name, order, steps):
+    start = dpend.released(0.6, 0.4)
+    exact = dpend.flow(paper, start, 0.4, Scheme("rk8", 0.4 / 400))
+    ends = [dpend.flow(paper, start, 0.4, Scheme(name, 0.4 / n)) for n in steps]
+    errors = [max(abs(end.theta1 - exact.theta1), abs(end.theta2 - exact.theta2)) for end in ends]
+    measured = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert Scheme(name, 0.1).order == order
+    assert abs(measured - order) < 0.15
+
+
+def test_rk4_is_the_papers_step(paper):
+    """3000 steps of 1 ms against a plain numpy loop of the classical method on the paper's own equations."""
+    l1, l2, m1, m2, g = (float(value) for value in jax.tree.leaves(paper))
+    mu = m2 / m1
+
+    def slope(x):
+        theta1, theta2, p1, p2 = x
+        s, c = np.sin(theta1 - theta2), np.cos(theta1 - theta2)
+        depth = 1 + mu * s**2
+        square = p1**2 / (m1 * l1**2) + p2**2 * (1 + mu) / (m2 * l2**2)
+        force = (square * mu * c - p1 * p2 * (1 + mu + mu * c**2) / (m1 * l1 * l2)) * s / depth**2
+        return np.array(
+            [
+                (p1 / (m1 * l1**2) - p2 * c / (m1 * l1 * l2)) / depth,
+                (p2 * (1 + mu) / (m2 * l2**2) - p1 * c / (m1 * l1 * l2)) / depth,
+                force - (m1 + m2) * g * l1 * np.sin(theta1),
+                -force - m2 * g * l2 * np.sin(theta2),
+            ]
+        )
+
+    x, h = np.array([np.radians(40), np.radians(49.1), 0.0, 0.0]), 1e-3
+    for _ in range(3000):
+        k1 = slope(x)
+        k2 = slope(x + h / 2 * k1)
+        k3 = slope(x + h / 2 * k2)
+        k4 = slope(x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    end = dpend.flow(paper, dpend.released(np.radians(40), np.radians(49.1)), 3.0, Scheme("rk4", 1e-3))
+    np.testing.assert_allclose(jax.tree.leaves(end), x, rtol=0, atol=2e-13)
+
+
+@pytest.mark.parametrize("name", ["rk4", "rk8"])
+def test_tangents_are_derivatives_and_leave_the_motion_alone(paper, name):
+    scheme = Scheme(name, 0.01)
+    tangents = State(*np.eye(4))
+    state, moved = jax.jit(scheme.advance_tangents)(paper, STATE, tangents, 0.01)
+    alone = jax.jit(scheme.advance)(paper, STATE, 0.01)
+    assert [float(x) for x in jax.tree.leaves(state)] == [float(x) for x in jax.tree.leaves(alone)]
+    nudge = 1e-6
+    ahead = jax.jit(scheme.advance)(paper, State(1.0 + nudge, -0.7, 0.01, 0.004), 0.01)
+    behind = jax.jit(scheme.advance)(paper, State(1.0 - nudge, -0.7, 0.01, 0.004), 0.01)
+    difference = [(a - b) / (2 * nudge) for a, b in zip(jax.tree.leaves(ahead), jax.tree.leaves(behind), strict=True)]
+    np.testing.assert_allclose([leaf[0] for leaf in jax.tree.leaves(moved)], difference, atol=2e-10)
+
+
+def test_schemes_refuse_what_they_cannot_be():
+    with pytest.raises(ValueError, match="method must be one of rk4, rk8, got 'euler'"):
+        Scheme("euler", 0.1)
+    for step in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="step must be a finite positive number"):
+            Scheme("rk8", step)
+    with pytest.raises(ValueError, match="step must not be longer than the motion of 1 s, got 1.5"):
+        Scheme("rk8", 1.5).steps(1.0)
+
+
+def test_number_of_steps():
+    assert [Scheme("rk8", 0.1).steps(t) for t in (0.0, 0.1, 1.0, 1.01, -0.3)] == [0, 1, 10, 11, 3]

@@ -1,0 +1,191 @@
+"""Motions against other integrators and invariants; what a result says of itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dpend
+from dpend import Pendulum, Scheme, State, Status
+
+RELEASE = dpend.released(np.radians(100), np.radians(-30))
+RK8 = Scheme("rk8", 4e-3)
+
+
+def leaves(state):
+    return np.array([float(leaf) for leaf in jax.tree.leaves(state)])
+
+
+def test_scipy_and_diffrax_agree_with_flow(paper):
+    """Three integrators, two of them not ours, over 2 s of large swings."""
+    field = jax.jit(lambda x: jnp.stack(jax.tree.leaves(dpend.vector_field(paper, State(*x)))))
+    scipy = solve_ivp(
+        lambda t, x: np.array(field(x)), (0, 2), leaves(RELEASE), method="DOP853", rtol=1e-13, atol=1e-15
+    )
+    ours = dpend.flow(paper, RELEASE, 2.0, Scheme("rk8", 2e-3))
+    diffrax = dpend.reference(paper, RELEASE, [2.0])
+    np.testing.assert_allclose(leaves(ours), scipy.y[:, -1], rtol=0, atol=2e-10)
+    np.testing.assert_allclose(leaves(ours)[:2], [diffrax.state.theta1[-1], diffrax.state.theta2[-1]], atol=2e-10)
+
+
+def test_time_reversal(paper):
+    there = dpend.flow(paper, RELEASE, 1.5, RK8)
+    np.testing.assert_allclose(leaves(dpend.flow(paper, there, -1.5, RK8)), leaves(RELEASE), rtol=0, atol=1e-9)
+    turned = dpend.flow(paper, State(there.theta1, there.theta2, -there.p1, -there.p2), 1.5, RK8)
+    np.testing.assert_allclose(leaves(turned), leaves(RELEASE), rtol=0, atol=1e-9)
+
+
+def test_angular_momentum_is_kept_without_gravity():
+    pendulum = Pendulum(0.3, 0.2, 0.1, 0.4, 0.0)
+    start = dpend.momenta(pendulum, 0.4, -1.0, 5.0, -9.0)
+    end = dpend.flow(pendulum, start, 3.0, RK8)
+    np.testing.assert_allclose(end.p1 + end.p2, start.p1 + start.p2, rtol=1e-13)
+    assert abs(end.p1 - start.p1) > 1e-2  # neither is kept alone
+
+
+def test_a_light_lower_bob_leaves_a_simple_pendulum():
+    """m2 -> 0: period 4 K(sin^2(a/2)) sqrt(l/g)."""
+    from scipy.special import ellipk
+
+    amplitude = 2.0
+    pendulum = Pendulum(1.0, 0.7, 1.0, 1e-9, 1.0)
+    quarter = float(ellipk(np.sin(amplitude / 2) ** 2))
+    end = dpend.flow(pendulum, dpend.released(amplitude, 0.3), quarter, Scheme("rk8", 2e-3))
+    assert abs(end.theta1) < 1e-8
+
+
+@pytest.mark.parametrize("steps", [100, 1500])
+def test_reverse_mode_agrees_with_forward_mode(paper, steps):
+    """Short motions, and long ones that are checkpointed."""
+    scheme = Scheme("rk8", 1.0 / steps)
+
+    def end(theta1, theta2, pendulum):
+        return dpend.flow(pendulum, dpend.released(theta1, theta2), 1.0, scheme).theta2
+
+    forward = jax.jacfwd(end, (0, 1, 2))(1.1, 0.4, paper)
+    reverse = jax.grad(end, (0, 1, 2))(1.1, 0.4, paper)
+    np.testing.assert_allclose(jax.tree.leaves(reverse), jax.tree.leaves(forward), rtol=1e-10)
+    nudge = 1e-6
+    difference = (end(1.1 + nudge, 0.4, paper) - end(1.1 - nudge, 0.4, paper)) / (2 * nudge)
+    np.testing.assert_allclose(forward[0], difference, rtol=1e-8)
+
+
+def test_the_derivative_by_time_is_the_vector_field(paper):
+    def end(duration):
+        return dpend.flow(paper, RELEASE, duration, RK8).theta1
+
+    slope = dpend.vector_field(paper, dpend.flow(paper, RELEASE, 0.7, RK8)).theta1
+    np.testing.assert_allclose([jax.grad(end)(0.7), jax.jit(jax.jacfwd(end))(0.7)], slope, rtol=1e-9)
+
+
+def test_traced_durations_give_the_same_motion(paper):
+    known = dpend.flow(paper, RELEASE, 0.7, RK8)
+    traced = jax.jit(lambda duration: dpend.flow(paper, RELEASE, duration, RK8))(0.7)
+    np.testing.assert_allclose(leaves(traced), leaves(known), rtol=1e-12)
+    many = jax.vmap(lambda duration: dpend.flow(paper, RELEASE, duration, RK8).theta1)(jnp.array([0.3, 0.7]))
+    np.testing.assert_allclose(many[1], known.theta1, rtol=1e-13)
+
+
+def test_fold_sees_every_step_once(paper):
+    def count(carry, time, dt, state):
+        steps, path, latest = carry
+        return steps + 1, path + dt * dpend.velocities(paper, state)[0], time
+
+    steps, path, latest = dpend.fold(count, (0, 0.0, 0.0), paper, RELEASE, 1.0, Scheme("rk8", 3e-4))
+    end = dpend.flow(paper, RELEASE, 1.0, Scheme("rk8", 3e-4))
+    assert steps == 3334
+    np.testing.assert_allclose(latest, 1.0, rtol=1e-14)
+    # The rectangle rule over the velocity, which ends off by half a step of it.
+    half = 0.5 / 3334 * dpend.velocities(paper, end)[0]
+    np.testing.assert_allclose(path - half, end.theta1 - RELEASE.theta1, atol=1e-5)
+
+
+def test_simulate_saves_what_was_asked(paper):
+    motion = dpend.simulate(paper, RELEASE, 1.0, step=1e-2, method="rk4", save_every=7)
+    np.testing.assert_allclose(motion.time, np.append(np.arange(0, 100, 7), 100) * 1e-2, rtol=1e-14)
+    end = dpend.flow(paper, RELEASE, 1.0, Scheme("rk4", 1e-2))
+    np.testing.assert_allclose([leaf[-1] for leaf in jax.tree.leaves(motion.state)], leaves(end), rtol=1e-13)
+    np.testing.assert_allclose([leaf[0] for leaf in jax.tree.leaves(motion.state)], leaves(RELEASE))
+    backwards = dpend.simulate(paper, end, -1.0, step=1e-2, method="rk4", save_every=100)
+    np.testing.assert_allclose(backwards.state.theta1[-1], RELEASE.theta1, atol=1e-3)
+
+
+@pytest.mark.parametrize("options", [{"step": 1e-3, "method": "rk4"}, {"step": 5e-3}, {"tolerance": 1e-8}])
+def test_error_estimate_is_the_error(paper, options):
+    motion = dpend.simulate(paper, RELEASE, 2.0, **options)
+    exact = dpend.reference(paper, RELEASE, motion.time[1:])
+    error = max(
+        np.abs(np.array(motion.state.theta1[1:]) - np.array(exact.state.theta1)).max(),
+        np.abs(np.array(motion.state.theta2[1:]) - np.array(exact.state.theta2)).max(),
+    )
+    assert motion.status == Status.CONVERGED
+    assert 0.8 < motion.error_estimate / error < 1.25
+    assert error < options.get("tolerance", 1.0)
+
+
+def test_what_went_wrong_is_a_status(paper):
+    def status(pendulum, state, duration, **options):
+        return Status(int(dpend.simulate(pendulum, state, duration, **options).status))
+
+    fast = dpend.momenta(paper, 0.3, 0.1, 500.0, -500.0)
+    assert status(paper, RELEASE, 1.0, step=0.2) == Status.STEP_TOO_LARGE
+    assert status(paper, fast, 1.0, step=0.01) == Status.STEP_TOO_LARGE
+    assert status(paper, RELEASE, 3.0, step=0.02, method="rk4") == Status.DRIFT_ABOVE_TOLERANCE
+    assert status(paper, State(jnp.nan * jnp.ones(()), 0.0, 0.0, 0.0), 1.0, step=0.01) == Status.NONFINITE
+    chaotic = dpend.released(np.radians(170), np.pi)
+    assert status(paper, chaotic, 20.0, step=1e-3) == Status.BEYOND_HORIZON
+    assert status(paper, chaotic, 20.0, tolerance=1e-6) == Status.BEYOND_HORIZON
+    assert status(paper, RELEASE, 1.0, step=5e-3, error=False) == Status.CONVERGED
+    assert len({dpend.message(member) for member in Status}) == len(Status)
+
+
+def test_fast_spin_with_a_step_small_enough():
+    """500 rad/s without gravity: the energy and the sum of the momenta stay."""
+    pendulum = Pendulum(g=0.0)
+    motion = dpend.simulate(pendulum, dpend.momenta(pendulum, 0.3, 0.1, 500.0, 480.0), 0.2, tolerance=1e-9)
+    assert motion.status == Status.CONVERGED
+    assert motion.energy_drift < 1e-10
+
+
+def test_reference_takes_as_many_steps_as_it_needs(paper):
+    """diffrax stops at 4096 by default."""
+    swing = dpend.find_orbit(paper, np.radians(20), branch="in-phase")
+    times = float(swing.period) * np.array([1.0, 80.0])
+    motion = dpend.reference(paper, swing.state, times)
+    assert motion.steps > 4096
+    assert motion.status == Status.CONVERGED
+    np.testing.assert_allclose(motion.state.theta1, swing.theta1, atol=1e-8)
+
+
+def test_reference_gives_up_on_what_is_not_finite(paper):
+    lost = dpend.reference(paper, State(jnp.asarray(jnp.nan), 0.0, 0.0, 0.0), [1.0])
+    assert lost.status == Status.NONFINITE
+    backwards = dpend.reference(paper, RELEASE, [-0.5, -1.0])
+    np.testing.assert_allclose(backwards.state.theta1[1], dpend.flow(paper, RELEASE, -1.0, RK8).theta1, atol=1e-9)
+
+
+def test_bad_input_is_refused(paper):
+    for options, text in (
+        ({"duration": 0.0}, "duration must be a finite number .* other than zero"),
+        ({"duration": float("nan")}, "duration must be a finite number"),
+        ({"step": 2.0}, "step must not be longer than the motion of 1 s, got 2"),
+        ({"step": 0.0}, "step must be a finite positive number"),
+        ({"step": 0.1, "tolerance": 1e-6}, "step and tolerance exclude each other"),
+        ({"tolerance": -1.0}, "tolerance must be a finite positive number"),
+        ({"method": "euler"}, "method must be one of"),
+        ({"step": 0.1, "save_every": 0}, "save_every must be an integer of at least 1, got 0"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            dpend.simulate(paper, RELEASE, **({"duration": 1.0} | options))
+    for times in ([], [1.0, 0.5], [-1.0, 1.0], [float("nan")]):
+        with pytest.raises(ValueError, match="times must be finite and move away from zero"):
+            dpend.reference(paper, RELEASE, times)
+
+
+def test_dataset_has_units_and_degrees(paper):
+    data = dpend.simulate(paper, RELEASE, 0.5, step=0.01).to_xarray()
+    assert {name: data[name].units for name in ("theta1", "p2", "time", "theta1_deg")} == {
+        "theta1": "rad", "p2": "kg m^2/s", "time": "s", "theta1_deg": "degree"
+    }  # fmt: skip
+    np.testing.assert_allclose(np.radians(data.theta2_deg), data.theta2, rtol=1e-15)
