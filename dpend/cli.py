@@ -28,16 +28,36 @@ app = typer.Typer(
     help="The motions of a double pendulum that come back. Angles in degrees, everything else in SI units.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode=None,  # square brackets are units here
     pretty_exceptions_enable=False,
 )
 
-_Length1 = Annotated[float, typer.Option("--l1", help="Length of the upper rod [m].")]
-_Length2 = Annotated[float, typer.Option("--l2", help="Length of the lower rod [m].")]
-_Mass1 = Annotated[float, typer.Option("--m1", help="Mass of the upper bob [kg].")]
-_Mass2 = Annotated[float, typer.Option("--m2", help="Mass of the lower bob [kg].")]
-_Gravity = Annotated[float, typer.Option("--g", help="Acceleration of gravity [m/s^2].")]
+
+def _number(text: str | float) -> float:  # defaults come as what they are
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not a number: give one like 40 or 1e-3") from None
+
+
+def _integer(text: str | int) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not an integer: give one like 1") from None
+
+
+def _numeric(*names: str, help: str) -> Any:
+    return typer.Option(*names, help=help, parser=_number, metavar="NUMBER")
+
+
+_Length1 = Annotated[float, _numeric("--l1", help="Length of the upper rod [m].")]
+_Length2 = Annotated[float, _numeric("--l2", help="Length of the lower rod [m].")]
+_Mass1 = Annotated[float, _numeric("--m1", help="Mass of the upper bob [kg].")]
+_Mass2 = Annotated[float, _numeric("--m2", help="Mass of the lower bob [kg].")]
+_Gravity = Annotated[float, _numeric("--g", help="Acceleration of gravity [m/s^2].")]
 _Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-_Theta1 = Annotated[float, typer.Option("--theta1", help="Release angle of the upper rod [deg].")]
+_Theta1 = Annotated[float, _numeric("--theta1", help="Release angle of the upper rod [deg].")]
 
 
 @app.callback()
@@ -51,15 +71,20 @@ def orbit(
     branch: Annotated[
         str | None, typer.Option(help="in-phase or anti-phase; both, if neither this nor a guess is given.")
     ] = None,
-    theta2: Annotated[float | None, typer.Option(help="Guess of the lower rod's release angle [deg].")] = None,
-    period: Annotated[float | None, typer.Option(help="Guess of the period [s].")] = None,
+    theta2: Annotated[float | None, _numeric(help="Guess of the lower rod's release angle [deg].")] = None,
+    period: Annotated[float | None, _numeric(help="Guess of the period [s].")] = None,
     symmetry: Annotated[
         str | None, typer.Option(help="centred or brake, with a guess; found out if not given.")
     ] = None,
     ratio: Annotated[
-        int | None, typer.Option(help="1 or -1: ask for theta2 = ratio theta1, with theta1 nearest to the one given.")
+        int | None,
+        typer.Option(
+            parser=_integer, metavar="INTEGER", help="1 or -1: theta2 = ratio theta1, the release nearest to THETA1."
+        ),
     ] = None,
-    crossing: Annotated[int, typer.Option(help="Which of the branch's passages through theta1.")] = 1,
+    crossing: Annotated[
+        int, typer.Option(parser=_integer, metavar="INTEGER", help="Which of the branch's passages through theta1.")
+    ] = 1,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -92,14 +117,14 @@ def orbit(
 @app.command()
 def simulate(
     theta1: _Theta1,
-    theta2: Annotated[float, typer.Option(help="Release angle of the lower rod [deg].")],
-    duration: Annotated[float, typer.Option(help="How long [s]; negative runs backwards.")],
-    p1: Annotated[float, typer.Option("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")] = 0.0,
-    p2: Annotated[float, typer.Option("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")] = 0.0,
+    theta2: Annotated[float, _numeric(help="Release angle of the lower rod [deg].")],
+    duration: Annotated[float, _numeric(help="How long [s]; negative runs backwards.")],
+    p1: Annotated[float, _numeric("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")] = 0.0,
+    p2: Annotated[float, _numeric("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")] = 0.0,
     method: Annotated[str, typer.Option(help="rk4 or rk8.")] = "rk8",
-    step: Annotated[float | None, typer.Option(help="Largest step [s].")] = None,
+    step: Annotated[float | None, _numeric(help="Largest step [s].")] = None,
     tolerance: Annotated[
-        float | None, typer.Option(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
+        float | None, _numeric(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")] = None,
     l1: _Length1 = 0.2,
@@ -299,8 +324,8 @@ def _keep_compiled_code() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def _complain(error: BaseException) -> None:
-    print("dpend: " + " ".join(str(error).split()), file=sys.stderr)
+def _complain(text: str) -> None:
+    print("dpend: " + " ".join(text.split()), file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -319,14 +344,13 @@ def _run(arguments: list[str]) -> int:
         return 130
     except typer.Exit as stop:
         return stop.exit_code
-    except (ValueError, OSError) as error:
-        _complain(error)
-        return 2
-    except RuntimeError as error:
-        # The command line's own usage errors are RuntimeErrors that know how to say what was wrong with the arguments.
+    except Exception as error:
+        # The command line's own errors know how to name the option they are about.
         usage = getattr(error, "format_message", None)
-        _complain(RuntimeError(usage()) if usage else error)
-        return 2 if usage else 1
+        if usage is None and not isinstance(error, (ValueError, OSError, RuntimeError)):
+            raise
+        _complain(usage() if usage else str(error))
+        return 1 if usage is None and isinstance(error, RuntimeError) else 2
 
 
 if __name__ == "__main__":

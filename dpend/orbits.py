@@ -638,7 +638,7 @@ def _mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
     def flip(state: State) -> State:
         return State(sign * state.theta1, sign * state.theta2, state.p1, state.p2)
 
-    turns = tuple(jnp.where(sign < 0, -turn, turn) for turn in orbit.turns)
+    turns = (jnp.where(sign < 0, -orbit.turns[0], orbit.turns[0]), jnp.where(sign < 0, -orbit.turns[1], orbit.turns[1]))
     return replace(orbit, state=flip(orbit.state), dual=flip(orbit.dual), turns=turns)
 
 

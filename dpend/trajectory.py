@@ -418,7 +418,12 @@ def _error_of(pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-de
 
 
 def reference(
-    pendulum: Pendulum, state: State, times: ArrayLike | Sequence[float], *, tolerance: float = 1e-13, error: bool = True
+    pendulum: Pendulum,
+    state: State,
+    times: ArrayLike | Sequence[float],
+    *,
+    tolerance: float = 1e-13,
+    error: bool = True,
 ) -> Trajectory:
     """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's integrators.
 

@@ -20,9 +20,7 @@ def leaves(state):
 def test_scipy_and_diffrax_agree_with_flow(paper):
     """Three integrators, two of them not ours, over 2 s of large swings."""
     field = jax.jit(lambda x: jnp.stack(jax.tree.leaves(dpend.vector_field(paper, State(*x)))))
-    scipy = solve_ivp(
-        lambda t, x: np.array(field(x)), (0, 2), leaves(RELEASE), method="DOP853", rtol=1e-13, atol=1e-15
-    )
+    scipy = solve_ivp(lambda t, x: np.array(field(x)), (0, 2), leaves(RELEASE), method="DOP853", rtol=1e-13, atol=1e-15)
     ours = dpend.flow(paper, RELEASE, 2.0, Scheme("rk8", 2e-3))
     diffrax = dpend.reference(paper, RELEASE, [2.0])
     np.testing.assert_allclose(leaves(ours), scipy.y[:, -1], rtol=0, atol=2e-10)
@@ -89,7 +87,7 @@ def test_traced_durations_give_the_same_motion(paper):
 
 def test_fold_sees_every_step_once(paper):
     def count(carry, time, dt, state):
-        steps, path, latest = carry
+        steps, path, _ = carry
         return steps + 1, path + dt * dpend.velocities(paper, state)[0], time
 
     steps, path, latest = dpend.fold(count, (0, 0.0, 0.0), paper, RELEASE, 1.0, Scheme("rk8", 3e-4))

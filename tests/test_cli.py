@@ -1,0 +1,184 @@
+"""The command line: exactly one JSON object, one line for bad input, and files that are whole."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dpend
+from dpend import cli
+
+
+@pytest.fixture(autouse=True)
+def _no_cache(monkeypatch):
+    """In these tests the process is pytest's own: its compiled code is not to be kept."""
+    monkeypatch.setattr(cli, "_keep_compiled_code", lambda: None)
+
+
+def run(capsys, *arguments):
+    status = cli._run([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def run_json(capsys, *arguments):
+    status, out, err = run(capsys, *arguments, "--json")
+    assert err == ""
+    return status, json.loads(out)
+
+
+def test_both_partners_of_forty_degrees(capsys):
+    status, found = run_json(capsys, "orbit", "--theta1", 40)
+    assert status == 0
+    inner, outer = found["orbits"]
+    assert abs(inner["theta2_deg"] - 49.066544773743) < 1e-9
+    assert abs(outer["theta2_deg"] + 51.139513966294) < 1e-9
+    assert [inner["branch"], outer["branch"]] == ["in-phase", "anti-phase"]
+    assert inner.keys() >= set(
+        "theta1_deg theta2_deg period_s energy_J residual iterations status symmetry kappa stability dual turns"
+        " error_estimate".split()
+    )
+    assert inner["error_estimate"].keys() == {"theta2_deg", "period_s"}
+    assert (inner["status"], inner["symmetry"], inner["stability"]) == ("converged", "centred", "elliptic")
+    # H of the release itself.
+    expected = -0.2 * 9.8 * 0.2 * np.cos(np.radians(40)) - 0.1 * 9.8 * 0.2 * np.cos(np.radians(49.066544773743))
+    assert abs(inner["energy_J"] - expected) < 1e-12
+
+
+def test_the_table_names_both_partners(capsys):
+    status, out, err = run(capsys, "orbit", "--theta1", "-40")
+    assert (status, err) == (0, "")
+    assert "-49.066544774" in out
+    assert "51.139513966" in out
+    assert "theta2 (deg)" in out
+
+
+def test_guess_and_ratio(capsys):
+    status, brake = run_json(capsys, "orbit", "--theta1", 40, "--theta2", 119.4, "--period", 1.28)
+    assert (status, brake["symmetry"]) == (0, "brake")
+    assert abs(brake["theta2_deg"] - 119.491215917) < 1e-8
+    status, line = run_json(capsys, "orbit", "--theta1", 64.3, "--ratio", 1)
+    assert abs(line["theta1_deg"] - 64.342841896400) < 1e-9
+
+
+def test_what_did_not_converge_says_why(capsys):
+    status, orbit = run_json(capsys, "orbit", "--theta1", 181, "--branch", "in-phase")
+    assert (status, orbit["status"]) == (1, "no_such_orbit")
+    assert "largest" in orbit["message"]
+    status, motion = run_json(capsys, "simulate", "--theta1", 170, "--theta2", 180, "--duration", 20, "--step", 0.002)
+    assert (status, motion["status"]) == (1, "beyond_horizon")
+
+
+def test_nan_and_infinity_are_null(capsys):
+    cli._print_json({"a": float("nan"), "b": [float("inf"), 1.0]})
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0]}
+
+
+def test_simulate(capsys, paper):
+    status, motion = run_json(
+        capsys, "simulate", "--theta1", 40, "--theta2", 49.1, "--duration", 3, "--method", "rk4", "--step", 0.001
+    )
+    end = dpend.flow(paper, dpend.released(np.radians(40), np.radians(49.1)), 3.0, dpend.Scheme("rk4", 1e-3))
+    assert status == 0
+    assert motion["steps"] == 3000
+    assert abs(motion["final"]["theta1_deg"] - np.degrees(end.theta1)) < 1e-9
+    assert motion["final"].keys() == {"theta1_deg", "theta2_deg", "p1", "p2"}
+    assert motion["error_estimate"] < 1e-8
+    assert motion["energy_drift"] < 1e-10
+
+
+def test_files_hold_the_motion(capsys, tmp_path):
+    import xarray
+
+    common = ("simulate", "--theta1", 40, "--theta2", 10, "--p1", 0.01, "--duration", 1, "--step", 0.01)
+    for name in ("motion.csv", "motion.nc"):
+        assert run(capsys, *common, "--out", tmp_path / name)[0] == 0
+    table = np.genfromtxt(tmp_path / "motion.csv", delimiter=",", names=True)
+    assert table.dtype.names == ("time_s", "theta1_deg", "theta2_deg", "p1_kg_m2_s", "p2_kg_m2_s")
+    with xarray.open_dataset(tmp_path / "motion.nc", engine="scipy") as data:
+        np.testing.assert_allclose(np.radians(table["theta1_deg"]), data.theta1, rtol=1e-15)
+        np.testing.assert_allclose(table["p1_kg_m2_s"][0], 0.01)
+        assert data.theta1.units == "rad"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["motion.csv", "motion.nc"]
+
+
+def test_a_failed_write_leaves_the_old_file(capsys, tmp_path, monkeypatch):
+    target = tmp_path / "motion.csv"
+    target.write_text("old")
+
+    def fails(motion, path):
+        path.write_text("half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(cli, "_write_csv", fails)
+    arguments = ("simulate", "--theta1", 40, "--theta2", 10, "--duration", 1, "--step", 0.01, "--out", target)
+    status, _, err = run(capsys, *arguments)
+    assert (status, err) == (2, "dpend: disk full\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["motion.csv"]
+    assert target.read_text() == "old"
+
+
+SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("orbit", "--theta1", "nan"), "theta1 .*finite number .* nan"),
+        (("orbit", "--theta1", "inf"), "theta1 .*finite number .* inf"),
+        (("orbit", "--theta1", "forty"), "--theta1.*forty"),
+        (("orbit",), "--theta1"),
+        (("orbit", "--theta1", "40", "--m1", "0"), "m1 .*positive .* 0"),
+        (("orbit", "--theta1", "40", "--l2", "-0.2"), "l2 .*positive .* -0.2"),
+        (("orbit", "--theta1", "40", "--g", "0"), "g must be positive for an orbit, got 0"),
+        (("orbit", "--theta1", "40", "--g", "-9.8"), "g must be positive for an orbit, got -9.8"),
+        (("orbit", "--theta1", "180", "--branch", "in-phase"), "theta1 .*multiple of 180 degrees .* got 180"),
+        (("orbit", "--theta1", "0"), "theta1 .*multiple of 180"),
+        (("orbit", "--theta1", "180", "--theta2", "0", "--period", "1"), "equilibrium"),
+        (("orbit", "--theta1", "40", "--branch", "sideways"), "branch .*in-phase, anti-phase.* 'sideways'"),
+        (
+            ("orbit", "--theta1", "40", "--branch", "in-phase", "--theta2", "49", "--period", "1.2"),
+            "branch and guess exclude",
+        ),
+        (("orbit", "--theta1", "40", "--theta2", "49"), "period must be given with theta2"),
+        (("orbit", "--theta1", "40", "--period", "1.2"), "theta2 must be given with period"),
+        (("orbit", "--theta1", "40", "--theta2", "49", "--period", "0"), "period .*positive"),
+        (("orbit", "--theta1", "40", "--ratio", "3"), "ratio must be 1 or -1, got 3"),
+        (("orbit", "--theta1", "40", "--colour", "red"), "--colour"),
+        (("orbits", "--theta1", "40"), "orbits"),
+        ((*SIMULATE, "--step", "0"), "step .*positive .* 0"),
+        ((*SIMULATE, "--step", "2"), "step must not be longer than the motion"),
+        ((*SIMULATE, "--step", "0.1", "--tolerance", "1e-6"), "step and tolerance exclude"),
+        ((*SIMULATE, "--method", "euler"), "method must be one of rk4, rk8"),
+        ((*SIMULATE[:-1], "0"), "duration"),
+        ((*SIMULATE, "--p1", "nan"), "p1 .*finite"),
+        ((*SIMULATE, "--out", "motion.xls"), "out must end in .csv or .nc"),
+        ((*SIMULATE, "--out", "/no/such/place/motion.csv"), "out must be a file in a directory"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_two(capsys, arguments, words):
+    import re
+
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert re.search(words, err), err
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+
+
+def test_the_program_itself(tmp_path):
+    """A process of its own: entry point, cache directory, and the compile options switched off."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "DPEND_PLAIN_JAX": "1"}
+    command = [Path(sys.executable).parent / "dpend", "orbit", "--theta1", "40", "--branch", "in-phase", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert abs(json.loads(done.stdout)["theta2_deg"] - 49.066544773743) < 1e-9
+    assert list((tmp_path / "dpend").iterdir())
+    refused = subprocess.run([*command[:2], "--theta1", "nan"], capture_output=True, text=True, env=environment)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("dpend: theta1 must be a finite number")
+    assert refused.stderr.count("\n") == 1

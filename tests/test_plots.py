@@ -1,0 +1,57 @@
+"""What is drawn is what was computed."""
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import dpend
+from dpend import plots
+
+
+@pytest.fixture(scope="module")
+def motion(paper):
+    return dpend.simulate(paper, dpend.released(1.0, 0.5), 1.0, step=0.01)
+
+
+@pytest.fixture(autouse=True)
+def _close():
+    yield
+    plt.close("all")
+
+
+def test_path_and_angles_are_in_degrees(motion):
+    curve = plots.path(motion).lines[0]
+    np.testing.assert_allclose(np.radians(curve.get_xdata()), motion.state.theta1, rtol=1e-14)
+    np.testing.assert_allclose(np.radians(curve.get_ydata()), motion.state.theta2, rtol=1e-14)
+    ax = plots.angles(motion)
+    np.testing.assert_allclose(ax.lines[1].get_ydata(), curve.get_ydata())
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "angle (deg)")
+
+
+def test_energies_add_up_to_a_constant(paper, motion):
+    ax = plots.energy(paper, motion)
+    total = sum(line.get_ydata() for line in ax.lines)
+    np.testing.assert_allclose(total, total[0], rtol=1e-9)
+    assert ax.get_legend().get_texts()[0].get_text() == "kinetic, upper bob"
+
+
+def test_strobe_draws_rods_of_the_right_length(paper, motion):
+    ax = plots.strobe(paper, motion, every=10)
+    lengths = [np.hypot(np.diff(line.get_xdata()), np.diff(line.get_ydata())) for line in ax.lines]
+    rods = [length[0] for length in lengths if length.size == 1]
+    assert len(rods) == 2 * 11
+    np.testing.assert_allclose(rods, 0.2, rtol=1e-14)
+
+
+def test_orbit_sheet_shows_whole_orbits(paper):
+    orbit = dpend.find_orbit(paper, np.radians(40), branch="in-phase")
+    figure = plots.orbit_sheet({"in-phase": orbit})
+    _, path, angles = figure.axes
+    x = path.lines[0].get_xdata()
+    np.testing.assert_allclose([x[0], x[-1]], 40, atol=1e-9)
+    np.testing.assert_allclose(x[len(x) // 2], -40, atol=1e-9)
+    assert "elliptic" in angles.get_title()
