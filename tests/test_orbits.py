@@ -308,4 +308,6 @@ def test_extreme_mass_ratios(mass):
         if orbit.status == Status.CONVERGED:
             assert orbit.error_estimate[0] < 1e-9
             back = dpend.reference(pendulum, orbit.state, [float(orbit.period) / 4])
-            assert max(abs(back.state.theta1[0]), abs(back.state.theta2[0])) < 1e-8
+            missed = max(abs(back.state.theta1[0]), abs(back.state.theta2[0]))
+            # Both integrations' own errors, grown as the motion grows.
+            assert missed < 1e-9 + 10 * back.error_estimate + 1e-10 * abs(orbit.kappa) ** 0.5
