@@ -30,6 +30,7 @@ from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, normal_modes, n
 from dpend.stability import half_trace, kappa_of_brake, stability_class, transition
 from dpend.steppers import Scheme
 from dpend.trajectory import Status, known_value, march, nothing, step_size
+from dpend.trig import sincos
 
 BRANCHES = ("in-phase", "anti-phase")
 SYMMETRIES = ("centred", "brake")
@@ -37,8 +38,8 @@ SYMMETRIES = ("centred", "brake")
 _PARTS = {"centred": 4, "brake": 2}
 
 _RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
-# rate times step [rad]: 0.06 leaves errors of some 1e-13 in theta2 and T; the walk along a branch needs no such digits.
-_FINE, _COARSE = 0.06, 0.25
+# rate times step [rad]: 0.1 leaves errors of rounding in theta2 and T; the walk along a branch needs no such digits.
+_FINE, _COARSE = 0.1, 0.4
 # A number of steps at which a motion cannot be what was meant: the search is lost.
 _MOST_STEPS = 200_000
 
@@ -133,9 +134,16 @@ def _steps_for(log_time: Scalar, rate: Scalar, turn: Scalar) -> Scalar:
 
 
 def _fastest(pendulum: Pendulum, state: State) -> Scalar:
-    """The rate that decides the step [rad/s]: of the linear motion, and of the rods and the angle between them."""
+    """The rate that decides the step [rad/s]: of the linear motion, of the rods, and of the inertia they share.
+
+    The last is 1/(1 + mu sin^2 delta), which a heavy lower bob makes narrow: it changes when the angle delta between
+    the rods does by sqrt(sin^2 delta + 1/mu).
+    """
     rates = vector_field(pendulum, state)
-    spin = rates.theta1**2 + rates.theta2**2 + (rates.theta1 - rates.theta2) ** 2
+    mu = pendulum.m2 / pendulum.m1
+    sin_delta, _ = sincos(state.theta1 - state.theta2)
+    narrow = (1 + mu) / (1 + mu * sin_delta**2)
+    spin = rates.theta1**2 + rates.theta2**2 + narrow * (rates.theta1 - rates.theta2) ** 2
     return jnp.sqrt(_clock(pendulum) ** 2 + spin)
 
 
@@ -173,15 +181,15 @@ def _shoot(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, s
 
 # The largest update of x [rad] and of log T in one iteration.
 _LARGEST_UPDATE = 0.5
-# Updates below this many units of rounding, grown as the motion grows, are noise.
-_ROUNDING = 64 * np.finfo(np.float64).eps
 _LEAST_DAMPING = 2.0**-12
+# An update this small that is not shortened by this much damping is noise; the error estimate says how much.
+_SMALL, _STALLED = 1e-6, 2.0**-4
 
 
 class _Newton(NamedTuple):
     x: Scalar
     log_time: Scalar
-    size: Scalar
+    size: Scalar  # of the next update, relative to the amplitude
     shot: _Shot
     update: Float[Array, "2"]
     damping: Scalar
@@ -195,30 +203,31 @@ def _newton(
 ) -> _Newton:  # fmt: skip
     """Damped Newton for (x, log of the shooting time), the step count held fixed so that the equations are smooth.
 
-    An update that does not reduce the residual is halved. It has converged when the next update is below `tolerance`
-    (relative to the amplitude, at most 1), or when the residual is down to rounding and falls no further.
+    An update is halved until the next one, taken with the same Jacobian, is shorter: Deuflhard's natural monotonicity
+    test, which does not depend on the conditioning of the equations. It has converged when the next update is below
+    `tolerance` (relative to the amplitude, at most 1), or is small and no damping shortens it: that is rounding.
     """
 
     def shoot(x: Scalar, log_time: Scalar) -> _Shot:
         return _shoot(pendulum, line.base + x * line.direction, log_time, steps, symmetry, turns)
 
-    def newton_update(shot: _Shot) -> Array:
-        square = jnp.column_stack([shot.jacobian[:, :2] @ line.direction, shot.jacobian[:, 2]])
+    def newton_update(jacobian: Array, value: Array) -> Array:
+        square = jnp.column_stack([jacobian[:, :2] @ line.direction, jacobian[:, 2]])
         determinant = square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0]
         adjugate = jnp.array([[square[1, 1], -square[0, 1]], [-square[1, 0], square[0, 0]]])
-        return -(adjugate @ shot.value) / determinant
+        return -(adjugate @ value) / determinant
 
     def iterate(s: _Newton) -> _Newton:
         trial = jnp.stack([s.x, s.log_time]) + s.damping * s.update
         shot = shoot(*trial)
-        size = jnp.max(jnp.abs(shot.value))
-        better = size < s.size
         amplitude = jnp.minimum(1.0, jnp.max(jnp.abs(line.base + trial[0] * line.direction)))
-        floor = _ROUNDING * jnp.max(jnp.abs(shot.jacobian)) * amplitude
-        stalled = ~better & (s.size <= floor)
-        update = newton_update(shot)
-        largest = jnp.max(jnp.abs(update) / jnp.stack([amplitude, 1.0]))
-        converged = (better & (largest <= tolerance)) | stalled
+        unit = jnp.stack([amplitude, 1.0])
+        same_jacobian = jnp.max(jnp.abs(newton_update(s.shot.jacobian, shot.value)) / unit)
+        better = jnp.where(jnp.isinf(s.size), jnp.all(jnp.isfinite(shot.jacobian)), same_jacobian < s.size)
+        stalled = ~better & (s.size <= _SMALL) & (s.damping <= _STALLED)
+        update = newton_update(shot.jacobian, shot.value)
+        size = jnp.max(jnp.abs(update) / unit)
+        converged = (better & (size <= tolerance)) | stalled
         singular = better & ~jnp.all(jnp.isfinite(update))
         lost = ~better & (s.damping <= _LEAST_DAMPING)
         trivial = jnp.exp(trial[1]) * _clock(pendulum) < _SHORTEST
@@ -261,15 +270,19 @@ _SHORTEST = 0.02
 _FIRST_STEP, _LONGEST_STEP = 0.02, 0.5
 # A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of the step's length).
 _LEAST_COSINE, _LARGEST_MISS, _WANTED_MISS = 0.95, 0.1, 0.02
-# Newton's second update over its first (Deuflhard, Newton Methods for Nonlinear Problems, section 5.1).
+# Newton's second update over its first (Deuflhard's contraction test).
 _LARGEST_CONTRACTION = 0.05
 _MOST_POINTS = 600
 # Where steps must be shorter than this, the integration is as fine as for the digits: its error, grown by the condition
 # of the equations, is what the walk would stumble over.
 _CAREFUL = 0.015
-# Two curves that pass each other closer than this [rad] count as crossing: the walk goes straight on, by a leap.
-_CROSSING = 1e-4
-_LEAPS = np.array([1e-3, 1e-2])
+# Two curves that pass each other closer than this [rad] count as crossing: the walk goes straight on, by a leap
+# along the tangent from before the curve began to turn into the other.
+_CROSSING = 2e-4
+_LEAPS = (0.003, 0.01, 0.03)
+_LARGEST_LEAP_MISS = 0.3
+# Where no leap lands it is a turn, however sharp, and is followed with steps down to this [rad].
+_SHORTEST_STEP = 1e-6
 _WALK_TOLERANCE = 1e-6
 # Closer than this to the upright state [rad] the branch counts as ended in its homoclinic limit.
 _UPRIGHT = 1e-4
@@ -356,6 +369,7 @@ class _Piece(NamedTuple):
 class _Walk(NamedTuple):
     piece: _Piece
     side: Scalar
+    straight: Float[Array, "3"]
     step: Scalar
     leaps: Scalar
     rate: Scalar
@@ -385,27 +399,30 @@ def _walk(pendulum: Pendulum, mode: Any, target: Scalar, crossing: Scalar, ratio
 
     def advance(w: _Walk) -> _Walk:
         piece = w.piece
-        tangent = piece.end_slope
-        # Without a step behind it the cubic has length zero: then the tangent alone predicts.
-        along = jnp.where(w.points > 0, 1 + w.step / jnp.where(w.points > 0, piece.length, 1.0), 1.0)
-        predicted = jnp.where(w.points > 0, piece.at(along), piece.end + w.step * tangent)
+        leaping = (w.leaps > 0) & (w.leaps <= len(_LEAPS))
+        tangent = jnp.where(leaping, w.straight, piece.end_slope)
+        # The cubic predicts up to twice its own length; without one behind, or for a leap, the tangent does.
+        near = (w.step <= 2.1 * piece.length) & ~leaping
+        along = 1 + jnp.where(near, w.step / piece.length, 0.0)
+        predicted = jnp.where(near, piece.at(along), piece.end + w.step * tangent)
         turn = jnp.where(w.step < _CAREFUL, _FINE, _COARSE)
         steps = _steps_for(predicted[2], w.rate, turn)
         new = _corrected(pendulum, predicted, tangent, steps, turns, "centred", _WALK_TOLERANCE)
         miss = jnp.max(jnp.abs(new.point - predicted)) / w.step
         resolved = 2 * _steps_for(new.point[2], new.rate, turn) <= 3 * steps
-        smooth = (new.side == w.side) | (w.points == 0) | (w.leaps > 0)
-        smooth &= (new.contraction <= _LARGEST_CONTRACTION) | (w.leaps > 0)
-        good = new.converged & smooth & (new.tangent @ tangent >= _LEAST_COSINE) & (miss <= _LARGEST_MISS)
+        smooth = ((new.side == w.side) | (w.points == 0)) & (new.contraction <= _LARGEST_CONTRACTION)
+        smooth = jnp.where(leaping, miss <= _LARGEST_LEAP_MISS, smooth & (miss <= _LARGEST_MISS))
+        good = new.converged & smooth & (new.tangent @ tangent >= _LEAST_COSINE)
         length = jnp.linalg.norm(new.point - piece.end)
-        taken = _Piece(piece.end, tangent, new.point, new.tangent, length)
+        taken = _Piece(piece.end, piece.end_slope, new.point, new.tangent, length)
         growth = jnp.clip((_WANTED_MISS / jnp.fmax(miss, 1e-9)) ** 0.25, 0.5, 2.0)
         held = jnp.where(good | ~new.converged, w.rate, jnp.fmax(w.rate, new.rate))
         after = w._replace(
             piece=taken,
             side=new.side,
+            straight=jnp.where(w.step >= 10 * _CROSSING, new.tangent, w.straight),
             step=jnp.minimum(w.step * growth, _LONGEST_STEP),
-            leaps=jnp.asarray(0),
+            leaps=jnp.where(leaping | (w.step >= 2 * _CROSSING), 0, w.leaps),
             rate=new.rate,
             iterations=new.iterations,
             points=w.points + 1,
@@ -413,12 +430,12 @@ def _walk(pendulum: Pendulum, mode: Any, target: Scalar, crossing: Scalar, ratio
         )
         after = _looked_at(after, wanted, target, crossing, ratio, origin)
         # Where even the shortest step is refused, the curve all but meets another: straight on, over the place.
-        further = (w.leaps > 0) | (w.step < 2 * _CROSSING)
+        further = leaping | (w.step < 2 * jnp.where(w.leaps > 0, _SHORTEST_STEP, _CROSSING))
         leaps = jnp.where(good | ~further, w.leaps, w.leaps + 1)
-        shorter = jnp.where(leaps > 0, jnp.asarray(_LEAPS)[jnp.minimum(leaps, len(_LEAPS)) - 1], w.step / 2)
+        shorter = jnp.where(leaps == w.leaps, w.step / 2, jnp.asarray([*_LEAPS, _CROSSING, 0.0])[leaps - 1])
         back = w._replace(step=jnp.where(good, w.step, shorter), rate=jnp.where(good, new.rate, held), leaps=leaps)
         chosen = jax.tree.map(partial(jnp.where, good & resolved), after, back)
-        gave_up = (leaps > len(_LEAPS)) | (chosen.points >= _MOST_POINTS) | (w.attempts >= 3 * _MOST_POINTS)
+        gave_up = (leaps > len(_LEAPS) + 1) | (chosen.points >= _MOST_POINTS) | (w.attempts >= 3 * _MOST_POINTS)
         status = jnp.where((chosen.status == _RUNNING) & gave_up, Status.LEFT_BRANCH, chosen.status)
         return chosen._replace(attempts=w.attempts + 1, status=status)
 
@@ -426,8 +443,8 @@ def _walk(pendulum: Pendulum, mode: Any, target: Scalar, crossing: Scalar, ratio
     finite = jnp.isfinite(target + jnp.sum(origin) + jnp.sum(slope))
     start = _Walk(
         _Piece(origin, slope, origin, slope, jnp.asarray(0.0)),
-        side=jnp.asarray(0.0), step=jnp.asarray(_FIRST_STEP), leaps=zero, rate=_clock(pendulum), iterations=zero,
-        points=zero, attempts=zero, crossings=zero, best=origin, reach=origin, away=jnp.asarray(False),
+        side=jnp.asarray(0.0), straight=slope, step=jnp.asarray(_FIRST_STEP), leaps=zero, rate=_clock(pendulum),
+        iterations=zero, points=zero, attempts=zero, crossings=zero, best=origin, reach=origin, away=jnp.asarray(False),
         found=jnp.asarray(False), status=jnp.where(finite, _RUNNING, Status.NONFINITE),
     )  # fmt: skip
     return lax.while_loop(lambda w: w.status == _RUNNING, advance, start)
@@ -611,10 +628,10 @@ def _orbit(
     kappa, log_abs_kappa = _kappas(symmetry, known, jnp.stack([*pack, theta1, theta2, log_time]), steps)
     if symmetry == "centred":
         dual = released(2 * jnp.pi * turns[0] - theta1, 2 * jnp.pi * turns[1] - theta2)
-        residual = newton.size
+        residual = jnp.max(jnp.abs(newton.shot.value))
     else:
         dual = released(newton.shot.end.theta1, newton.shot.end.theta2)
-        residual = newton.size * jnp.exp(newton.log_time) * _clock(pendulum)
+        residual = jnp.max(jnp.abs(newton.shot.value)) * jnp.exp(newton.log_time) * _clock(pendulum)
     return PeriodicOrbit(
         pendulum=pendulum,
         state=state,
@@ -784,7 +801,7 @@ def find_orbit(
             centred if the orbit is that; under tracing it stays brake, of which every centred orbit is a case.
         ratio: +1 or -1.
         crossing: which of the branch's passages through `theta1`, in order of arclength.
-        turn: how far the fastest motion may advance in one integration step [rad]; 0.06 leaves errors near 1e-13.
+        turn: how far the fastest motion may advance in one integration step [rad]; 0.1 leaves little but rounding.
         tolerance: on the last Newton update, of theta2 [rad] relative to an amplitude below 1, and of log T. 1e-13 is
             where rounding begins.
         max_iterations: Newton iterations at most, at least 1, which is to evaluate the guess.
