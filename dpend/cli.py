@@ -26,7 +26,6 @@ from dpend.trajectory import Status, Trajectory
 app = typer.Typer(
     name="dpend",
     help="The motions of a double pendulum that come back. Angles in degrees, everything else in SI units.",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,  # square brackets are units here
     pretty_exceptions_enable=False,
@@ -339,7 +338,7 @@ def _run(arguments: list[str]) -> int:
         jax.config.update("jax_enable_x64", True)
     _keep_compiled_code()
     try:
-        return int(app(arguments, standalone_mode=False) or 0)
+        return int(app(arguments or ["--help"], standalone_mode=False) or 0)
     except (KeyboardInterrupt, typer.Abort):
         return 130
     except typer.Exit as stop:

@@ -246,6 +246,8 @@ def _weakly_float64(leaf: Any) -> Any:
 # In one step a rod may turn, and the fast mode advance, by this much [rad]: beyond it neither method resolves the
 # motion, whatever the energy says.
 _LARGEST_TURN = 1.0
+# 3 GB of saved states.
+_MOST_SAVED = 100_000_000
 # An error of this many radians is no small error: the computed motion has parted from the true one.
 _PARTED = 0.1
 
@@ -350,7 +352,7 @@ def simulate(
         Trajectory.
     Raises:
         ValueError: duration zero or not finite, both step and tolerance given, a step not positive or longer than the
-            motion, an unknown method, save_every below 1.
+            motion, an unknown method, save_every below 1, more than 1e8 states to save.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -370,6 +372,11 @@ def simulate(
     else:
         scheme = Scheme(method, step)
     steps = scheme.steps(known)
+    if steps // save_every > _MOST_SAVED:
+        raise ValueError(
+            f"step must leave at most {_MOST_SAVED:,} states to save, got {scheme.step:g} s, which makes "
+            f"{steps // save_every:,}: give a larger step or save_every, or a shorter duration"
+        )
     every = min(int(save_every), steps)
     return _simulate(
         pendulum, state, jnp.asarray(duration, jnp.float64), steps, scheme, every, error, wanted, drift_tolerance
@@ -385,15 +392,22 @@ _ONLY_ROUNDING = 1e-18
 def _scheme_reaching(pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float) -> Scheme:
     """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding allows."""
     rate = float(jnp.maximum(_fast_frequency(pendulum), _fastest(pendulum, state)))
-    march = Scheme(method, abs(duration))  # its step is not used: one compiled search for all steps
+    search = Scheme(method, abs(duration))  # its step is not used: one compiled search for all steps
+    if not math.isfinite(rate):
+        return search  # whatever the step, the status will say so
     steps, before = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN)), math.inf
+    if steps > _MOST_SAVED:
+        raise ValueError(
+            f"duration must be at most some {_FIRST_TURN * _MOST_SAVED / rate:.1e} s for a tolerance, "
+            f"got {duration:g}: give a shorter one, or a step"
+        )
     while True:
         scheme = Scheme(method, abs(duration) / steps)
-        error = float(_error_of(pendulum, state, step_size(duration, steps), jnp.asarray(steps), march))
+        error = float(_error_of(pendulum, state, step_size(duration, steps), jnp.asarray(steps), search))
         stalled = error < 1e-3 and error > before / 2
-        if error <= tolerance or stalled or (rate * scheme.step) ** march.order < _ONLY_ROUNDING:
+        if error <= tolerance or stalled or (rate * scheme.step) ** search.order < _ONLY_ROUNDING:
             return scheme
-        missing = (2 * error / tolerance) ** (1 / march.order) if math.isfinite(error) else 4.0
+        missing = (2 * error / tolerance) ** (1 / search.order) if math.isfinite(error) else 4.0
         steps, before = math.ceil(steps * min(max(missing, 1.2), 4.0)), error
 
 

@@ -153,6 +153,8 @@ SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
         ((*SIMULATE, "--step", "0"), "step .*positive .* 0"),
         ((*SIMULATE, "--step", "2"), "step must not be longer than the motion"),
         ((*SIMULATE, "--step", "0.1", "--tolerance", "1e-6"), "step and tolerance exclude"),
+        ((*SIMULATE[:-1], "1e9", "--step", "1e-3"), "step must leave at most 100,000,000 states"),
+        ((*SIMULATE[:-1], "1e9"), "duration must be at most"),
         ((*SIMULATE, "--method", "euler"), "method must be one of rk4, rk8"),
         ((*SIMULATE[:-1], "0"), "duration"),
         ((*SIMULATE, "--p1", "nan"), "p1 .*finite"),

@@ -131,6 +131,7 @@ def test_what_went_wrong_is_a_status(paper):
     assert status(paper, fast, 1.0, step=0.01) == Status.STEP_TOO_LARGE
     assert status(paper, RELEASE, 3.0, step=0.02, method="rk4") == Status.DRIFT_ABOVE_TOLERANCE
     assert status(paper, State(jnp.nan * jnp.ones(()), 0.0, 0.0, 0.0), 1.0, step=0.01) == Status.NONFINITE
+    assert status(paper, State(jnp.nan * jnp.ones(()), 0.0, 0.0, 0.0), 1.0) == Status.NONFINITE
     chaotic = dpend.released(np.radians(170), np.pi)
     assert status(paper, chaotic, 20.0, step=1e-3) == Status.BEYOND_HORIZON
     assert status(paper, chaotic, 20.0, tolerance=1e-6) == Status.BEYOND_HORIZON
