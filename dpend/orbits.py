@@ -4,9 +4,8 @@ Shooting for a periodic orbit of a conservative system is singular by two. Relea
 given, theta2 and the period are two unknowns for two equations, without a phase or an energy condition.
 
 - brake: p(T/2) = 0, at rest again at the dual release;
-- centred: theta(T/4) = 0 modulo pi, half the integration, and x(T/2) = -x(0) up to full turns follows. Time reversal
-  about T/4 does it (Lamb and Roberts, Physica D 112, 1998, on reversing symmetries; Munoz-Almaraz et al., Physica D
-  181, 2003, on continuing symmetric orbits in a conservative system).
+- centred: theta(T/4) = 0 modulo pi, half the integration. The reversal (theta, p, t) -> (-theta, p, -t) about T/4 then
+  gives x(T/2) = -x(0) up to full turns.
 
 A branch is followed from its normal mode by pseudo-arclength in (theta1, theta2, log of the shooting time), so that
 turning points in theta1 are passed. Everything is traceable; derivatives with respect to the pendulum and the release
@@ -813,8 +812,8 @@ def find_orbit(
         ValueError: theta1 not finite; none or more than one of branch and guess; theta1 a multiple of pi with `branch`;
             both angles at an equilibrium; g not positive; an unknown branch, symmetry or ratio; a period not positive.
         RuntimeError: float64 is switched off in JAX.
-    Source: the brake-orbit conditions as in Hristov et al., arXiv:2308.16159 (three bodies); the arclength method as in
-        Peeters et al., Mechanical Systems and Signal Processing 23 (2009), section 3.
+    See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009), for families
+        of normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159, for the quarter period.
     """
     require_float64()
     theta1 = number("theta1", theta1, unit="rad")

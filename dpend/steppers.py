@@ -29,8 +29,8 @@ RK4 = Tableau(
     order=4,
 )
 
-# The 12-stage propagator of DOP853: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I (2nd ed.),
-# section II.5 (coefficients in the authors' program dop853.f), without its error estimators.
+# The 12-stage propagator of DOP853 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I), without its
+# error estimators; coefficients as in SciPy's dop853_coefficients.py.
 # fmt: off
 RK8 = Tableau(
     a=(

@@ -335,7 +335,7 @@ def simulate(
     """The motion from `state` over `duration`, with an estimate of its own error.
 
     The estimate is Richardson's, |x_h - x_(h/2)|/(1 - 2^-p): of the returned solution, at the worst saved time, in the
-    larger angle (Hairer, Norsett and Wanner I, section II.4).
+    larger angle.
 
     Arguments:
         pendulum, state: leaves are scalars.

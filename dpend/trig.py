@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dpend._runtime import require_float64
 
-# pi/2 in four pieces (Cody and Waite, 1980, chapter 8): the first three have 30 bits, so n times each is exact for
+# pi/2 in four pieces (Cody and Waite's reduction): the first three have 30 bits, so n times each is exact for
 # n < 2^23; the fourth is the rest rounded to 53 bits, and what it leaves out is below 2^-145 n. Three pieces in all
 # would leave thirteen units in the last place at the double nearest to -60130 pi/2.
 _PI_2 = (float.fromhex("0x1.921fb54p+0"), float.fromhex("0x1.10b46118p-30"), float.fromhex("0x1.313198ap-61"))
