@@ -812,8 +812,8 @@ def find_orbit(
         ValueError: theta1 not finite; none or more than one of branch and guess; theta1 a multiple of pi with `branch`;
             both angles at an equilibrium; g not positive; an unknown branch, symmetry or ratio; a period not positive.
         RuntimeError: float64 is switched off in JAX.
-    See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009), for families
-        of normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159, for the quarter period.
+    See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009): families of
+        normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159: the quarter period.
     """
     require_float64()
     theta1 = number("theta1", theta1, unit="rad")
