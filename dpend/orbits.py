@@ -718,7 +718,7 @@ def _near_guess(pendulum, line, x, log_time, symmetry, error, turn, tolerance, m
     newton, steps, change = _solved(fixed, still, first.x, log_time, first.shot.rate, turns, symmetry, settings)
     at_equilibrium = jnp.max(jnp.abs(jnp.sin(angles))) < _SAME
     status = jnp.where(first.status == Status.CONVERGED, newton.status, first.status)
-    status = jnp.where((status == Status.CONVERGED) & at_equilibrium, Status.TRIVIAL_ROOT, status)
+    status = jnp.where(at_equilibrium, Status.TRIVIAL_ROOT, status)
     newton = newton._replace(iterations=first.iterations + newton.iterations)
     return _orbit(pendulum, line, newton, steps, change, turns, symmetry, status)
 
