@@ -28,7 +28,7 @@ from dpend._runtime import require_float64
 from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, normal_modes, number, released, vector_field
 from dpend.stability import half_trace, kappa_of_brake, stability_class, transition
 from dpend.steppers import Scheme
-from dpend.trajectory import Status, known_value, march, nothing, step_size
+from dpend.trajectory import Status, known_value, march, moved, step_size
 from dpend.trig import sincos
 
 BRANCHES = ("in-phase", "anti-phase")
@@ -155,14 +155,12 @@ def _shoot(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, s
     time = jnp.exp(log_time)
     state = released(*angles)
 
-    def advance(pair: Any, dt: Scalar) -> Any:
-        return _RK8.advance_tangents(pendulum, pair[0], pair[1], dt)
+    def step(carry: Any, time: Scalar, dt: Scalar) -> Any:
+        state, tangents = _RK8.advance_tangents(pendulum, carry[0], carry[1], dt)
+        return state, tangents, jnp.fmax(carry[2], _fastest(pendulum, state))
 
-    def faster(rate: Scalar, time: Scalar, dt: Scalar, pair: Any) -> Scalar:
-        return jnp.fmax(rate, _fastest(pendulum, pair[0]))
-
-    start = (state, State(*jnp.eye(4)))
-    (end, tangents), rate = march(advance, start, step_size(time, steps), steps, faster, _fastest(pendulum, state))
+    start = (state, State(*jnp.eye(4)), _fastest(pendulum, state))
+    end, tangents, rate = march(step, start, step_size(time, steps), steps)
     matrix = jnp.stack(jax.tree.leaves(tangents))
     slope = vector_field(pendulum, end)
     if symmetry == "centred":
@@ -518,8 +516,7 @@ def _implicit_jvp(symmetry, primals, tangents):  # type: ignore[no-untyped-def]
         (x, log_time), parameters = both[:2], both[2:]
         pendulum, time, count = Pendulum(*parameters[:5]), jnp.exp(log_time), steps.astype(int)
         start = released(*(parameters[5:] + x * direction))
-        advance = partial(_RK8.advance, pendulum)
-        end, _ = march(advance, start, step_size(time, count), count, nothing, None)
+        end = moved(_RK8, pendulum, start, step_size(time, count), count)
         # Momenta without their unit: at a root the factor does not matter.
         return jnp.stack([end.theta1, end.theta2] if symmetry == "centred" else [end.p1, end.p2])
 
@@ -727,12 +724,12 @@ def _rate_along(pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, st
     """The largest rate on the way, and the angles at the end."""
     state = released(*(line.base + x * line.direction))
 
-    def faster(rate: Scalar, time: Scalar, dt: Scalar, state: State) -> Scalar:
-        return jnp.fmax(rate, _fastest(pendulum, state))
+    def step(carry: Any, time: Scalar, dt: Scalar) -> Any:
+        state = _RK8.advance(pendulum, carry[0], dt)
+        return state, jnp.fmax(carry[1], _fastest(pendulum, state))
 
-    advance = partial(_RK8.advance, pendulum)
     dt = step_size(jnp.exp(log_time), steps)
-    end, rate = march(advance, state, dt, steps, faster, _fastest(pendulum, state))
+    end, rate = march(step, (state, _fastest(pendulum, state)), dt, steps)
     return rate, jnp.stack([end.theta1, end.theta2])
 
 
@@ -745,9 +742,8 @@ def _cover(
     """
     k = jnp.arange(2 if symmetry == "brake" else 3, _LARGEST_COVER + 1, 1 if symmetry == "brake" else 2)
     state = released(*angles)
-    advance = partial(_RK8.advance, pendulum)
     dts = step_size(jnp.exp(log_time), k * steps)
-    ends, _ = jax.vmap(lambda dt: march(advance, state, dt, steps, nothing, None))(dts)
+    ends = jax.vmap(lambda dt: moved(_RK8, pendulum, state, dt, steps))(dts)
     reached = jnp.round(jnp.stack([ends.theta1, ends.theta2]) / jnp.pi)
     if symmetry == "centred":
         missed = jnp.abs(jnp.stack([ends.theta1, ends.theta2]) - jnp.pi * reached)

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from dpend.pendulum import Pendulum, Scalar, State
-from dpend.steppers import Scheme
-from dpend.trajectory import march, nothing, step_size
+from dpend.steppers import Point, Scheme
+from dpend.trajectory import march, step_size
 
 
 def transition(
@@ -30,11 +30,13 @@ def transition(
     Rows and columns are in the order theta1, theta2, p1, p2 and in SI units.
     """
 
-    def advance(pair: tuple[State, State], dt: Scalar) -> tuple[State, State]:
-        return scheme.advance_tangents(pendulum, *pair, dt)
+    constants = scheme.constants(pendulum, dt)
 
-    (end, tangents), _ = march(advance, (state, State(*jnp.eye(4))), dt, steps, nothing, None)
-    return end, jnp.stack(jax.tree.leaves(tangents))
+    def step(pair: tuple[Point, State], time: Scalar, dt: Scalar) -> tuple[Point, State]:
+        return scheme.move_tangents(constants, *pair)
+
+    end, tangents = march(step, (scheme.enter(pendulum, state), State(*jnp.eye(4))), dt, steps)
+    return scheme.leave(constants, end), jnp.stack(jax.tree.leaves(tangents))
 
 
 def monodromy(pendulum: Pendulum, state: State, period: float, scheme: Scheme) -> Float[Array, "4 4"]:

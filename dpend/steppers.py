@@ -1,17 +1,41 @@
 """One step of each integration method, and `Scheme`, the static pair of method and step that names a computation.
 
-A step is traceable in the pendulum, the state and the step itself; forward and reverse derivatives go through it.
+A step is traceable in the pendulum, the point and the step itself; forward and reverse derivatives go through it. The
+point that a step moves is not always a `State`. There are three forms:
+
+- canonical: the `State` itself, (theta, p);
+- circle: sine and cosine of both angles are carried as state, s' = c omega and c' = -s omega, and the angles are two
+  more sums that nothing depends on. No step computes a sine, which is half of the canonical form's work. Another
+  discretisation of the same equations: s^2 + c^2 = 1 holds to the method's error, no better.
+- rescaled: the circle form in a time s of its own, dt/ds = (1 + q/omega_f^2)^(-1/2) with
+  q = omega1^2 + omega2^2 + (omega1 - omega2)^2 and omega_f the fast normal mode's frequency. Equal steps in s are short
+  in t where the rods fly: each motion gets the steps that it needs, without a rejected one and without a branch.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from dpend.pendulum import Pendulum, Scalar, State, number, vector_field
+from dpend.pendulum import (
+    Pendulum,
+    Scalar,
+    State,
+    fast_frequency,
+    hamiltonian,
+    number,
+    reciprocal,
+    vector_field,
+)
+from dpend.trig import sincos
+
+# What a step moves: a pytree of scalars, the form's own.
+Point: TypeAlias = Any
 
 
 @dataclass(frozen=True)
@@ -59,38 +83,42 @@ RK8 = Tableau(
 # fmt: on
 
 # Up to this many stages are written out, the zeros of the tableau left out with them. Beyond it the stages run as a
-# loop: order 8 written out takes XLA six times as long to compile and runs 1.3 times as fast for one trajectory.
+# loop unless a scheme says otherwise: order 8 written out takes XLA six times as long to compile and runs 1.5 times as
+# fast for one trajectory, but several times as fast for many at once.
 _WRITTEN_OUT = 4
 
 
-def explicit_step(tableau: Tableau, field: Callable[[State], State], state: State, dt: Scalar) -> State:
-    """One step of size `dt` [s] of an explicit Runge-Kutta method for state' = field(state)."""
-    stages = len(tableau.b)
-    if stages <= _WRITTEN_OUT:
-        slopes: list[State] = []
+def explicit_step(
+    tableau: Tableau, increment: Callable[[Point], Point], point: Point, *, written_out: bool = True
+) -> Point:
+    """One step of an explicit Runge-Kutta method, where increment(point) is the slope at a point times the step."""
+    if written_out:
+        slopes: list[Point] = []
         for row in tableau.a:
-            slopes.append(field(_displaced(state, dt, row, slopes)))
-        return _displaced(state, dt, tableau.b, slopes)
+            slopes.append(increment(_displaced(point, row, slopes)))
+        return _displaced(point, tableau.b, slopes)
     weights, final = jnp.asarray(_square(tableau)), jnp.asarray(tableau.b)
-    leaves, structure = jax.tree.flatten(state)
+    leaves, structure = jax.tree.flatten(point)
     start = jnp.stack(leaves)
 
     def stage(index: Scalar, slopes: jax.Array) -> jax.Array:
-        here = start + dt * jnp.tensordot(weights[index], slopes, 1)
-        slope = field(jax.tree.unflatten(structure, list(here)))
+        here = start + jnp.tensordot(weights[index], slopes, 1)
+        slope = increment(jax.tree.unflatten(structure, list(here)))
         return slopes.at[index].set(jnp.stack(jax.tree.leaves(slope)))
 
+    stages = len(tableau.b)
     slopes_array = lax.fori_loop(0, stages, stage, jnp.zeros((stages, *start.shape)))
-    return jax.tree.unflatten(structure, list(start + dt * jnp.tensordot(final, slopes_array, 1)))
+    return jax.tree.unflatten(structure, list(start + jnp.tensordot(final, slopes_array, 1)))
 
 
-def _displaced(state: State, dt: Scalar, row: tuple[float, ...], slopes: list[State]) -> State:
-    """state + dt sum_j row_j slopes_j, without the terms whose weight is zero."""
+def _displaced(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Point:
+    """point + sum_j row_j slopes_j, without the terms whose weight is zero."""
     used = [(weight, slope) for weight, slope in zip(row, slopes, strict=True) if weight != 0.0]
     if not used:
-        return state
+        return point
+    weights = [weight for weight, _ in used]
     return jax.tree.map(
-        lambda x, *ks: x + dt * sum(w * k for (w, _), k in zip(used, ks, strict=True)), state, *(k for _, k in used)
+        lambda x, *ks: sum((w * k for w, k in zip(weights, ks, strict=True)), start=x), point, *(k for _, k in used)
     )
 
 
@@ -99,7 +127,199 @@ def _square(tableau: Tableau) -> list[list[float]]:
     return [[*row, *[0.0] * (stages - len(row))] for row in tableau.a]
 
 
-_TABLEAUS = {"rk4": RK4, "rk8": RK8}
+# --- the three forms -------------------------------------------------------------------------------------------------
+
+
+class _Circle(NamedTuple):
+    """A state without trigonometry, in units that leave the field four constants.
+
+    sin1 and cos1 lie on a circle of radius sqrt(mu), mu = m2/m1, so that their products with sin2 and cos2 are
+    sqrt(mu) times the sine and cosine of delta = theta1 - theta2; rate1 = p1/(m1 l1^2) and
+    rate2 = p2/(sqrt(mu) m1 l1 l2) are momenta [1/s].
+    """
+
+    theta1: Scalar
+    theta2: Scalar
+    sin1: Scalar
+    cos1: Scalar
+    sin2: Scalar
+    cos2: Scalar
+    rate1: Scalar
+    rate2: Scalar
+
+
+class _Rescaled(NamedTuple):
+    """A circle and the time [s] that it has reached."""
+
+    circle: _Circle
+    time: Scalar
+
+
+def _root_mu(pendulum: Pendulum) -> Scalar:
+    return jnp.sqrt(pendulum.m2 / pendulum.m1)
+
+
+def _rate_units(pendulum: Pendulum) -> tuple[Scalar, Scalar]:
+    """The momenta that belong to rate1 = rate2 = 1/s."""
+    unit1 = pendulum.m1 * pendulum.l1 * pendulum.l1
+    return unit1, _root_mu(pendulum) * pendulum.m1 * pendulum.l1 * pendulum.l2
+
+
+def _to_circle(pendulum: Pendulum, state: State) -> _Circle:
+    sin1, cos1 = sincos(state.theta1)
+    sin2, cos2 = sincos(state.theta2)
+    root = _root_mu(pendulum)
+    unit1, unit2 = _rate_units(pendulum)
+    return _Circle(state.theta1, state.theta2, root * sin1, root * cos1, sin2, cos2, state.p1 / unit1, state.p2 / unit2)
+
+
+class _Constants(NamedTuple):
+    """What a circle's slopes need of the pendulum and the step; computed once, outside the loop over steps."""
+
+    step: Scalar  # dt or ds [s]
+    unit1: Scalar  # the momenta that belong to rate1 = rate2 = 1/s
+    unit2: Scalar
+    per_unit1: Scalar  # their inverses: a division costs as much as a dozen multiplications
+    per_unit2: Scalar
+    mass_ratio: Scalar  # 1 + mu
+    ratio: Scalar  # l1/(l2 sqrt(mu))
+    back: Scalar  # its inverse
+    weight1: Scalar  # of gravity, times the step in time where all are equal
+    weight2: Scalar
+    rescaling: Scalar  # 1/omega_f^2, zero without gravity: nothing but the motion itself then sets a time
+
+
+def _circle_constants(pendulum: Pendulum, step: Scalar, even: bool) -> _Constants:
+    root = _root_mu(pendulum)
+    mass_ratio = 1.0 + pendulum.m2 / pendulum.m1
+    frequency = fast_frequency(pendulum)
+    swings = frequency > 0
+    times = step if even else 1.0
+    unit1, unit2 = _rate_units(pendulum)
+    return _Constants(
+        step,
+        unit1,
+        unit2,
+        1.0 / unit1,
+        1.0 / unit2,
+        mass_ratio,
+        pendulum.l1 / (root * pendulum.l2),
+        root * pendulum.l2 / pendulum.l1,
+        mass_ratio * pendulum.g / (pendulum.l1 * root) * times,
+        pendulum.g * root / pendulum.l1 * times,
+        jnp.where(swings, 1.0 / jnp.where(swings, frequency, 1.0) ** 2, 0.0),
+    )
+
+
+class _Nudge(NamedTuple):
+    """A displacement of a circle's angles, and its rates; the slopes are differentiated with respect to this."""
+
+    angle1: Scalar
+    angle2: Scalar
+    rate1: Scalar
+    rate2: Scalar
+
+
+class _Slopes(NamedTuple):
+    """What the increments are made of: omega dt of both rods and the rates' increments."""
+
+    turn1: Scalar
+    turn2: Scalar
+    rate1: Scalar
+    rate2: Scalar
+
+
+def _circle_slopes(constants: _Constants, even: bool, x: _Circle, nudge: _Nudge | None) -> tuple[_Slopes, Scalar]:
+    """Hamilton's equations times dt, and dt, at the nudged circle, to first order in a nudge of the angles.
+
+    sin(theta + angle) = sin theta + cos theta angle: exact for the first derivative, and a third of the operations of
+    differentiating the circle's four components.
+    """
+    sin_delta = x.sin1 * x.cos2 - x.cos1 * x.sin2
+    cos_delta = x.cos1 * x.cos2 + x.sin1 * x.sin2
+    sin1, sin2, rate1, rate2 = x.sin1, x.sin2, x.rate1, x.rate2
+    if nudge is not None:
+        between = nudge.angle1 - nudge.angle2
+        sin_delta, cos_delta = sin_delta + cos_delta * between, cos_delta - sin_delta * between
+        sin1, sin2 = sin1 + x.cos1 * nudge.angle1, sin2 + x.cos2 * nudge.angle2
+        rate1, rate2 = nudge.rate1, nudge.rate2
+    inverse = reciprocal(1.0 + sin_delta * sin_delta)
+    turn1 = rate1 - cos_delta * rate2
+    turn2 = constants.ratio * (constants.mass_ratio * rate2 - cos_delta * rate1)
+    dt, weight1, weight2 = constants.step, constants.weight1, constants.weight2
+    if not even:
+        # The pace dt/ds counts as a constant under differentiation: tangents then belong to one and the same time t,
+        # and the variational equations are integrated in s just as the motion is, to the method's order.
+        between = turn1 - turn2
+        spin = (turn1 * turn1 + turn2 * turn2 + between * between) * (inverse * inverse)
+        dt = lax.stop_gradient(dt / jnp.sqrt(1.0 + constants.rescaling * spin))
+        weight1, weight2 = weight1 * dt, weight2 * dt
+    step = dt * inverse
+    turn1 = turn1 * step
+    pull = turn1 * sin_delta * (turn2 * inverse)
+    fall1, fall2 = weight1 * sin1, weight2 * sin2
+    return _Slopes(turn1, turn2 * step, -(constants.back * pull) - fall1, pull - fall2), dt
+
+
+def _circle_moves(x: _Circle, slopes: _Slopes) -> _Circle:
+    """The circle's increments: s' = c omega, c' = -s omega."""
+    turn1, turn2, rate1, rate2 = slopes
+    return _Circle(turn1, turn2, x.cos1 * turn1, -x.sin1 * turn1, x.cos2 * turn2, -x.sin2 * turn2, rate1, rate2)
+
+
+def _circle_increment(constants: _Constants, x: _Circle) -> _Circle:
+    return _circle_moves(x, _circle_slopes(constants, True, x, None)[0])
+
+
+def _rescaled_increment(constants: _Constants, point: _Rescaled) -> _Rescaled:
+    slopes, dt = _circle_slopes(constants, False, point.circle, None)
+    return _Rescaled(_circle_moves(point.circle, slopes), dt)
+
+
+def _tangent_increment(constants: _Constants, even: bool, pair: tuple[Point, _Nudge]) -> tuple[Point, _Nudge]:
+    """Increments of a circle and of a tangent of it."""
+    point, tangent = pair
+    x = point if even else point.circle
+
+    def slopes(nudge: _Nudge) -> tuple[_Slopes, Scalar]:
+        return _circle_slopes(constants, even, x, nudge)
+
+    still = jnp.zeros_like(x.rate1)
+    (here, dt), (there, _) = jax.jvp(slopes, (_Nudge(still, still, x.rate1, x.rate2),), (tangent,))
+    moves = _circle_moves(x, here)
+    return moves if even else _Rescaled(moves, dt), _Nudge(*there)
+
+
+def _canonical_increment(constants: tuple[Pendulum, Scalar], state: State) -> State:
+    pendulum, dt = constants
+    return jax.tree.map(lambda slope: dt * slope, vector_field(pendulum, state))
+
+
+_INCREMENTS: dict[str, Callable[[Any, Any], Any]] = {
+    "canonical": _canonical_increment,
+    "circle": _circle_increment,
+    "rescaled": _rescaled_increment,
+}
+
+# --- methods ---------------------------------------------------------------------------------------------------------
+
+
+class _Method(NamedTuple):
+    tableau: Tableau
+    form: str  # canonical, circle or rescaled
+
+
+_METHODS = {
+    "rk4": _Method(RK4, "canonical"),
+    "rk8": _Method(RK8, "canonical"),
+    "rk4-circle": _Method(RK4, "circle"),
+    "rk8-circle": _Method(RK8, "circle"),
+    "rk8-circle-rescaled": _Method(RK8, "rescaled"),
+}
+# A release near the bottom swings slowly and evenly. Measured on releases over the whole square, the error of an
+# order-8 motion in rescaled time grows like (energy above the bottom)^2.4, which steps in proportion to energy^-0.3
+# even out; the longest are these times as long.
+_PACE_POWER, _LONGEST_PACE = -0.3, 2.6
 
 
 @dataclass(frozen=True)
@@ -107,45 +327,119 @@ class Scheme:
     """A method and its step: static and hashable, so that compiled functions are keyed by it.
 
     Attributes:
-        name: `rk4` (the classical method of order 4) or `rk8` (the 12-stage order-8 propagator of DOP853).
-        step: the largest step [s]; a motion of length t takes n = ceil(t/step) steps of t/n each.
+        name: `rk4` (the classical method of order 4) or `rk8` (the 12-stage order-8 propagator of DOP853), both in
+            (theta, p); `rk4-circle` and `rk8-circle`, the same without trigonometry; `rk8-circle-rescaled`, that in
+            rescaled time.
+        step: the step [s]. Even methods take n = ceil(t/step) steps of t/n each over a motion of length t; the
+            rescaled one takes steps in its own time, at most 2.6 `step` long near the bottom, shorter where it flies.
+        written_out: whether all stages of an order-8 step in (theta, p) are written out: slower to compile, faster for
+            many lanes. The circle forms always are.
     Raises:
         ValueError: an unknown name; a step that is not finite and positive.
     """
 
     name: str
     step: float
+    written_out: bool = False
 
     def __post_init__(self) -> None:
-        if self.name not in _TABLEAUS:
-            raise ValueError(f"method must be one of {', '.join(_TABLEAUS)}, got {self.name!r}")
+        if self.name not in _METHODS:
+            raise ValueError(f"method must be one of {', '.join(_METHODS)}, got {self.name!r}")
         object.__setattr__(self, "step", float(number("step", self.step, positive=True, unit="s")))
 
     @property
     def order(self) -> int:
         """The order p: the error of a motion falls like step^p."""
-        return _TABLEAUS[self.name].order
+        return _METHODS[self.name].tableau.order
 
-    def advance(self, pendulum: Pendulum, state: State, dt: Scalar) -> State:
-        """The state one step of `dt` [s] later; `dt` may be negative."""
-        return explicit_step(_TABLEAUS[self.name], lambda x: vector_field(pendulum, x), state, dt)
+    @property
+    def even(self) -> bool:
+        """Whether all steps are equally long in time."""
+        return self._form != "rescaled"
 
-    def advance_tangents(self, pendulum: Pendulum, state: State, tangents: State, dt: Scalar) -> tuple[State, State]:
-        """One step of the state together with tangent vectors, by forward differentiation of the step itself.
+    @property
+    def _form(self) -> str:
+        return _METHODS[self.name].form
+
+    @property
+    def plain(self) -> "Scheme":
+        """The same method in (theta, p), its stages not written out: for single steps, where compiling costs more."""
+        return Scheme("rk4" if _METHODS[self.name].tableau is RK4 else "rk8", self.step)
+
+    def enter(self, pendulum: Pendulum, state: State) -> Point:
+        """The method's own form of a state; `State` itself for methods in (theta, p)."""
+        if self._form == "canonical":
+            return state
+        circle = _to_circle(pendulum, state)
+        return circle if self.even else _Rescaled(circle, jnp.zeros_like(circle.rate1))
+
+    def leave(self, constants: Any, point: Point) -> State:
+        """The state that a point stands for."""
+        if self._form == "canonical":
+            return point
+        x = point if self.even else point.circle
+        return State(x.theta1, x.theta2, constants.unit1 * x.rate1, constants.unit2 * x.rate2)
+
+    def constants(self, pendulum: Pendulum, dt: Scalar) -> Any:
+        """What steps of `dt` [s] need, computed once; dt is of the method's own time, and may be negative."""
+        return (pendulum, dt) if self._form == "canonical" else _circle_constants(pendulum, dt, self.even)
+
+    def move(self, constants: Any, point: Point) -> Point:
+        """The point one step later."""
+        tableau = _METHODS[self.name].tableau
+        rolled = self._form == "canonical" and not self.written_out and len(tableau.b) > _WRITTEN_OUT
+        return explicit_step(tableau, partial(_INCREMENTS[self._form], constants), point, written_out=not rolled)
+
+    def move_tangents(self, constants: Any, point: Point, tangents: State) -> tuple[Point, State]:
+        """One step of a point together with tangent vectors, by forward differentiation.
+
+        In (theta, p) the step itself is differentiated; the circle forms apply the method to the variational equations
+        along its own stages, which is the same but for the circle's drift, and leaves four components of six. Neither
+        changes the point.
 
         Arguments:
-            tangents: as many vectors as wanted, leaves of shape (k,).
+            tangents: (d theta1, d theta2, d p1, d p2) as a `State`: one vector, with leaves of the point's shape, or
+                as many as wanted along a new leading axis.
         Returns:
-            The state, to the last bit that of `advance`, and the tangents.
+            The point and the tangents.
         """
 
-        def along(tangent: State) -> tuple[State, State]:
-            return jax.jvp(lambda x: self.advance(pendulum, x, dt), (state,), (tangent,))
+        if jnp.ndim(tangents.theta1) > jnp.ndim(jax.tree.leaves(point)[0]):
+            one = partial(self.move_tangents, constants, point)
+            return jax.vmap(one, out_axes=(None, 0))(tangents)
+        if self._form == "canonical":
+            return jax.jvp(partial(self.move, constants), (point,), (tangents,))
+        rates = constants.per_unit1 * tangents.p1, constants.per_unit2 * tangents.p2
+        nudge = _Nudge(tangents.theta1, tangents.theta2, *rates)
+        increment = partial(_tangent_increment, constants, self.even)
+        point, nudge = explicit_step(_METHODS[self.name].tableau, increment, (point, nudge))
+        return point, State(nudge.angle1, nudge.angle2, constants.unit1 * nudge.rate1, constants.unit2 * nudge.rate2)
 
-        return jax.vmap(along, out_axes=(None, 0))(tangents)
+    def advance(self, pendulum: Pendulum, point: Point, dt: Scalar) -> Point:
+        """The point one step of `dt` [s] later; `dt` may be negative."""
+        return self.move(self.constants(pendulum, dt), point)
+
+    def advance_tangents(self, pendulum: Pendulum, point: Point, tangents: State, dt: Scalar) -> tuple[Point, State]:
+        """The point and its tangents one step of `dt` [s] later."""
+        return self.move_tangents(self.constants(pendulum, dt), point, tangents)
+
+    @property
+    def evenly(self) -> "Scheme":
+        """The same method with equal steps in time: how the rescaled one lands on a wanted time."""
+        return self if self.even else Scheme("rk8-circle", self.step)
+
+    def pace(self, pendulum: Pendulum, state: State) -> Scalar:
+        """The length of this motion's steps in units of `step`: 1, but for rescaled time near the bottom."""
+        if self.even:
+            return jnp.ones_like(state.theta1)
+        bottom = (pendulum.m1 + pendulum.m2) * pendulum.l1 + pendulum.m2 * pendulum.l2
+        height = 0.5 * (hamiltonian(pendulum, state) / (jnp.abs(pendulum.g) * bottom) + 1.0)
+        height = jnp.where(jnp.isfinite(height), height, 1.0)  # no gravity, no bottom
+        longest = _LONGEST_PACE ** (1 / _PACE_POWER)
+        return lax.stop_gradient(jnp.clip(height, longest, 1.0) ** _PACE_POWER)
 
     def steps(self, duration: float) -> int:
-        """The number of steps that a motion of `duration` [s] takes: ceil(|duration|/step - 1e-9).
+        """The number of even steps that a motion of `duration` [s] takes: ceil(|duration|/step - 1e-9).
 
         Raises:
             ValueError: the step is longer than the motion.

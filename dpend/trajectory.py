@@ -4,10 +4,10 @@ independent solution by diffrax (`reference`). Also `Status`, the one vocabulary
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,11 @@ from jax import lax
 from jaxtyping import ArrayLike
 
 from dpend._runtime import require_float64
-from dpend.pendulum import Pendulum, Scalar, State, energy_scale, hamiltonian, normal_modes, number, vector_field
-from dpend.steppers import Scheme
+from dpend.pendulum import Pendulum, Scalar, State, energy_scale, fast_frequency, hamiltonian, number, vector_field
+from dpend.steppers import Point, Scheme
 from dpend.trig import LARGEST_ANGLE
 
 Carry = TypeVar("Carry")
-Point = TypeVar("Point")
 
 
 class Status(IntEnum):
@@ -115,47 +114,38 @@ _CHECKPOINT_ABOVE = 1024
 
 
 def march(
-    advance: Callable[[Point, Scalar], Point],
-    point: Point,
-    dt: Scalar,
-    steps: Scalar,
-    update: Callable[[Carry, Scalar, Scalar, Point], Carry],
-    carry: Carry,
-    first: Scalar = 0,
-) -> tuple[Point, Carry]:
-    """The loop under everything: `steps` times point = advance(point, dt), with `update` seeing each new point.
+    step: Callable[[Carry, Scalar, Scalar], Carry], carry: Carry, dt: Scalar, steps: Scalar, first: Scalar = 0
+) -> Carry:
+    """The loop under everything that takes even steps: `steps` times carry = step(carry, time, dt).
 
     Arguments:
+        step: told the time [s] at the end of its step.
         steps: an int compiles to a scan, which has both derivatives; a tracer to a loop with forward mode only.
-        first: the number of the first step, from which `update` is told the time.
+        first: the number of the first step, from which the time is counted.
     """
 
-    def one(index: Scalar, both: tuple[Point, Carry]) -> tuple[Point, Carry]:
-        point, carry = both
-        point = advance(point, dt)
-        return point, update(carry, jnp.asarray(index + 1, jnp.float64) * dt, dt, point)
+    def run(carry: Carry, first: Scalar, count: Scalar) -> Carry:
+        return lax.fori_loop(0, count, lambda i, c: step(c, jnp.asarray(first + i + 1, jnp.float64) * dt, dt), carry)
 
-    def run(both: tuple[Point, Carry], first: Scalar, count: Scalar) -> tuple[Point, Carry]:
-        return lax.fori_loop(0, count, lambda i, c: one(first + i, c), both)
-
-    both = (point, carry)
     if not isinstance(steps, int) or steps <= _CHECKPOINT_ABOVE:
-        return run(both, first, steps)
+        return run(carry, first, steps)
     block = math.isqrt(steps)
     blocks, rest = divmod(steps, block)
     again = jax.checkpoint(lambda c, i: run(c, first + i * block, block))
-    both, _ = lax.scan(lambda c, i: (again(c, i), None), both, jnp.arange(blocks))
-    return run(both, first + blocks * block, rest) if rest else both
+    carry, _ = lax.scan(lambda c, i: (again(c, i), None), carry, jnp.arange(blocks))
+    return run(carry, first + blocks * block, rest) if rest else carry
+
+
+def moved(scheme: Scheme, pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar) -> State:
+    """The state after `steps` even steps of `dt` [s]: `flow` for counts that may be traced."""
+    constants = scheme.constants(pendulum, dt)
+    end = march(lambda point, time, dt: scheme.move(constants, point), scheme.enter(pendulum, state), dt, steps)
+    return scheme.leave(constants, end)
 
 
 def step_size(duration: Scalar, steps: Scalar) -> Scalar:
     """duration/steps [s], for counts that may be traced."""
     return duration / jnp.asarray(steps, jnp.float64)
-
-
-def nothing(carry: None, time: Scalar, dt: Scalar, point: Any) -> None:
-    """The `update` of a motion of which only the end is wanted."""
-    return None
 
 
 def _float64(tree: Any) -> Any:
@@ -170,71 +160,142 @@ def known_value(value: Scalar) -> float | None:
         return None
 
 
-def _grid(duration: Scalar, scheme: Scheme) -> tuple[Scalar, Scalar]:
-    """The number of steps (an int where the duration is known) and their size."""
-    require_float64()
-    known = known_value(number("duration", duration, unit="s"))
-    if known is not None:
-        if not math.isfinite(known):
-            raise ValueError(f"duration must be a finite number [s], got {known}: give another duration")
-        steps: Scalar = scheme.steps(known)
-    else:
-        steps = jnp.maximum(jnp.ceil(jnp.abs(duration) / scheme.step - 1e-9), 1).astype(int)
-    return steps, step_size(jnp.asarray(duration, jnp.float64), steps if known is None else max(steps, 1))
+# A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns ten thousand times
+# as fast as any that gravity moves: the lane is given up, so that no other waits for it.
+_SHORTEST_STEP = 1e-4
 
 
-def _folded(update, init, pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-def]
-    return march(lambda x, h: scheme.advance(pendulum, x, h), state, dt, steps, update, init)
+class _Along(NamedTuple):
+    """What moves along a motion: the scheme's point, tangents (None without), and what `update` accumulates."""
+
+    point: Point
+    tangents: State | None
+    carry: Any
+
+
+def _folded(update, init, pendulum, state, tangents, duration, steps, scheme):  # type: ignore[no-untyped-def]
+    """The motion, its tangents and what `update` makes of it, over `duration`."""
+    along = _Along(scheme.enter(pendulum, state), tangents, init)
+    if scheme.even:
+        dt = step_size(duration, steps if not isinstance(steps, int) else max(steps, 1))
+        constants = scheme.constants(pendulum, dt)
+        step = _stepper(update, scheme, constants)
+        along = march(lambda along, time, dt: step(along, lambda _: (time, dt)), along, dt, steps)
+        return scheme.leave(constants, along.point), along.tangents, along.carry
+    return _unevenly(update, pendulum, state, along, duration, scheme)
+
+
+def _stepper(update, scheme, constants):  # type: ignore[no-untyped-def]
+    """One step shown to `update`; clock(point) tells the time reached and how long the step was."""
+
+    def step(along, clock):  # type: ignore[no-untyped-def]
+        if along.tangents is None:
+            point, tangents = scheme.move(constants, along.point), None
+            carry = update(along.carry, *clock(point), scheme.leave(constants, point))
+        else:
+            point, tangents = scheme.move_tangents(constants, along.point, along.tangents)
+            carry, tangents = update(along.carry, *clock(point), scheme.leave(constants, point), tangents)
+        return _Along(point, tangents, carry)
+
+    return step
+
+
+def _unevenly(update, pendulum, state, along, duration, scheme):  # type: ignore[no-untyped-def]
+    """Steps in the scheme's own time up to the last one before `duration`, and one in time itself onto it."""
+    sense = jnp.where(duration < 0, -1.0, 1.0)
+    ds = sense * scheme.step * scheme.pace(pendulum, state)
+    step = _stepper(update, scheme, scheme.constants(pendulum, ds))
+
+    def advance(both: tuple[_Along, Scalar]) -> tuple[_Along, Scalar]:
+        along, _ = both
+        before = along.point.time
+        ahead = step(along, lambda point: (point.time, point.time - before))
+        past = sense * (ahead.point.time - duration) >= 0  # then this step is not taken
+        lost = ~past & ~(jnp.abs(ahead.point.time - before) >= _SHORTEST_STEP * jnp.abs(ds))  # also where it is NaN
+        ahead = jax.tree.map(partial(jnp.where, past), along, ahead)
+        time = jnp.where(lost, jnp.nan, ahead.point.time)
+        return ahead._replace(point=ahead.point._replace(time=time)), ~(past | lost)
+
+    along, _ = lax.while_loop(lambda both: both[1], advance, (along, duration != 0))
+    rest = duration - along.point.time
+    constants = scheme.evenly.constants(pendulum, rest)
+    land = _stepper(update, scheme.evenly, constants)
+    along = land(along._replace(point=along.point.circle), lambda _: (duration, rest))
+    return scheme.evenly.leave(constants, along.point), along.tangents, along.carry
 
 
 _fold = jax.jit(_folded, static_argnames=("update", "steps", "scheme"))
 _fold_traced = jax.jit(_folded, static_argnames=("update", "scheme"))
 
 
+def _nothing(carry: Any, time: Scalar, dt: Scalar, state: State) -> Any:
+    """The `update` of a motion of which only the end is wanted."""
+    return carry
+
+
 def flow(pendulum: Pendulum, state: State, duration: Scalar, scheme: Scheme) -> State:
-    """The state after `duration`: n = ceil(duration/step - 1e-9) steps of duration/n each, no trajectory stored.
+    """The state after `duration`, no trajectory stored.
+
+    Even methods take n = ceil(duration/step - 1e-9) steps of duration/n each; the rescaled one takes steps in its own
+    time and one in time itself onto the end.
 
     Arguments:
         pendulum, state: leaves are scalars; `jax.vmap` maps over many.
         duration: time [s]; negative runs backwards, zero returns the state. A number known at trace time, or a value
             being differentiated by eager `grad`, fixes n and allows reverse mode (checkpointed beyond 1024 steps); a
-            traced one allows forward mode only.
+            traced one allows forward mode only, as does the rescaled method.
         scheme: method and step.
     Raises:
-        ValueError: duration not finite, or shorter than one step.
+        ValueError: duration not finite, or shorter than one even step.
         RuntimeError: float64 is switched off in JAX.
     """
-    end, _ = _accumulate(nothing, None, pendulum, state, duration, scheme)
+    end, _, _ = _accumulate(_nothing, None, pendulum, state, None, duration, scheme)
     return end
 
 
 def fold(
-    update: Callable[[Carry, Scalar, Scalar, State], Carry],
+    update: Callable[..., Any],
     init: Carry,
     pendulum: Pendulum,
     state: State,
     duration: Scalar,
     scheme: Scheme,
+    *,
+    tangents: State | None = None,
 ) -> Carry:
     """Something accumulated along the motion: `init` after `update` has seen every step.
 
     Arguments:
-        update: (carry, time, dt, state) -> carry, called after each step with the time [s] and state at its end.
-            Compiled functions are kept by its identity, so define it once, not inside a loop.
+        update: (carry, time, dt, state) -> carry, called after each step with the time [s] at its end, its length and
+            the state there. With `tangents`, (carry, time, dt, state, tangents) -> (carry, tangents): it sees them and
+            may scale or replace them. Compiled functions are kept by its identity: define it once, not in a loop.
         init: any pytree; Python numbers in it become float64.
         pendulum, state, duration, scheme: as for `flow`.
+        tangents: vectors (d theta1, d theta2, d p1, d p2) at t = 0 to carry along by the derivative of the flow: one,
+            or several along a leading axis.
     Raises:
-        ValueError: duration not finite, or shorter than one step.
+        ValueError: duration not finite, or shorter than one even step.
         RuntimeError: float64 is switched off in JAX.
     """
-    _, carry = _accumulate(update, init, pendulum, state, duration, scheme)
+    _, _, carry = _accumulate(update, init, pendulum, state, tangents, duration, scheme)
     return carry
 
 
-def _accumulate(update, init, pendulum, state, duration, scheme):  # type: ignore[no-untyped-def]
-    steps, dt = _grid(duration, scheme)
+def _accumulate(update, init, pendulum, state, tangents, duration, scheme):  # type: ignore[no-untyped-def]
+    require_float64()
+    known = known_value(number("duration", duration, unit="s"))
+    if known is not None and not math.isfinite(known):
+        raise ValueError(f"duration must be a finite number [s], got {known}: give another duration")
+    if not scheme.even:
+        steps: Scalar = 0  # not known beforehand
+    elif known is not None:
+        steps = scheme.steps(known)
+    else:
+        steps = jnp.maximum(jnp.ceil(jnp.abs(duration) / scheme.step - 1e-9), 1).astype(int)
     compiled = _fold if isinstance(steps, int) else _fold_traced
-    return compiled(update, jax.tree.map(_weakly_float64, init), pendulum, _float64(state), dt, steps, scheme)
+    init = jax.tree.map(_weakly_float64, init)
+    time = jnp.asarray(duration, jnp.float64)
+    return compiled(update, init, pendulum, _float64(state), _float64(tangents), time, steps, scheme)
 
 
 def _weakly_float64(leaf: Any) -> Any:
@@ -258,29 +319,23 @@ def _fastest(pendulum: Pendulum, state: State) -> Scalar:
     return jnp.maximum(jnp.abs(rates.theta1), jnp.abs(rates.theta2))
 
 
-def _fast_frequency(pendulum: Pendulum) -> Scalar:
-    """The fast mode's frequency [rad/s] for |g|: where gravity pulls upwards, the fastest escape."""
-    return normal_modes(replace(pendulum, g=jnp.abs(pendulum.g)))[1].frequency
-
-
 def _saved(pendulum, state, dt, steps, scheme, save_every):  # type: ignore[no-untyped-def]
     """Times and states at steps 0, save_every, 2 save_every, ..., steps, and the largest rate met on the way."""
 
-    def advance(state: State, dt: Scalar) -> State:
-        return scheme.advance(pendulum, state, dt)
+    constants = scheme.constants(pendulum, dt)
 
-    def faster(rate: Scalar, time: Scalar, dt: Scalar, state: State) -> Scalar:
-        return jnp.fmax(rate, _fastest(pendulum, state))
+    def step(carry, time, dt):  # type: ignore[no-untyped-def]
+        point = scheme.move(constants, carry[0])
+        return point, jnp.fmax(carry[1], _fastest(pendulum, scheme.leave(constants, point)))
 
     def segment(carry, index, count):  # type: ignore[no-untyped-def]
-        state, rate = carry
-        carry = march(advance, state, dt, count, faster, rate, index)
+        carry = march(step, carry, dt, count, index)
         # One row to save, not four: XLA would copy four arrays whole at every save.
-        return carry, jnp.stack(jax.tree.leaves(carry[0]))
+        return carry, jnp.stack(jax.tree.leaves(scheme.leave(constants, carry[0])))
 
     full, rest = divmod(steps, save_every)
     at = np.arange(full + 1) * save_every
-    carry = (state, _fastest(pendulum, state))
+    carry = (scheme.enter(pendulum, state), _fastest(pendulum, state))
     carry, rows = lax.scan(lambda c, i: segment(c, i, save_every), carry, jnp.asarray(at[:-1]))
     rows = jnp.concatenate([jnp.stack(jax.tree.leaves(state))[None], rows])
     if rest:
@@ -303,7 +358,7 @@ def _simulate(pendulum, state, duration, steps, scheme, save_every, error, wante
     status = jnp.where(estimate > wanted, Status.BEYOND_HORIZON, Status.CONVERGED)
     status = jnp.where(drift > drift_tolerance, Status.DRIFT_ABOVE_TOLERANCE, status)
     status = jnp.where(finite, status, Status.NONFINITE)
-    turn = jnp.maximum(rate, _fast_frequency(pendulum)) * jnp.abs(dt)
+    turn = jnp.maximum(rate, fast_frequency(pendulum)) * jnp.abs(dt)
     status = jnp.where(turn > _LARGEST_TURN, Status.STEP_TOO_LARGE, status)
     return Trajectory(time, states, drift, estimate, jnp.asarray(steps), status, scheme)
 
@@ -391,7 +446,7 @@ _ONLY_ROUNDING = 1e-18
 
 def _scheme_reaching(pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float) -> Scheme:
     """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding allows."""
-    rate = float(jnp.maximum(_fast_frequency(pendulum), _fastest(pendulum, state)))
+    rate = float(jnp.maximum(fast_frequency(pendulum), _fastest(pendulum, state)))
     search = Scheme(method, abs(duration))  # its step is not used: one compiled search for all steps
     if not math.isfinite(rate):
         return search  # whatever the step, the status will say so
@@ -415,15 +470,18 @@ def _scheme_reaching(pendulum: Pendulum, state: State, duration: float, method: 
 def _error_of(pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-def]
     """Richardson's estimate for `steps` steps of `dt`, both traced: two motions side by side, no state saved."""
 
-    def advance(state, dt):  # type: ignore[no-untyped-def]
-        return scheme.advance(pendulum, state, dt)
+    whole, half = scheme.constants(pendulum, dt), scheme.constants(pendulum, dt / 2)
 
-    def compare(carry, time, dt, coarse):  # type: ignore[no-untyped-def]
-        fine, worst = carry
-        fine, _ = march(advance, fine, dt / 2, 2, nothing, None)
-        return fine, jnp.fmax(worst, _angle_error(coarse, fine))
+    def step(carry, time, dt):  # type: ignore[no-untyped-def]
+        coarse, fine, worst = carry
+        coarse = scheme.move(whole, coarse)
+        fine = scheme.move(half, scheme.move(half, fine))
+        states = scheme.leave(whole, coarse), scheme.leave(half, fine)
+        return coarse, fine, jnp.fmax(worst, _angle_error(*states))
 
-    end, (_, worst) = march(advance, state, dt, steps, compare, (state, jnp.asarray(0.0)))
+    start = scheme.enter(pendulum, state)
+    end, _, worst = march(step, (start, start, jnp.asarray(0.0)), dt, steps)
+    end = scheme.leave(whole, end)
     lost = ~jnp.isfinite(end.theta1 + end.theta2 + end.p1 + end.p2)
     return jnp.where(lost, jnp.inf, worst / (1 - 2.0**-scheme.order))
 
@@ -483,7 +541,7 @@ def _dopri8(pendulum, state, times, tolerance):  # type: ignore[no-untyped-def]
     """States at `times`, steps taken, and whether diffrax succeeded."""
     import diffrax
 
-    rate = jnp.fmax(_fast_frequency(pendulum), _fastest(pendulum, state))
+    rate = jnp.fmax(fast_frequency(pendulum), _fastest(pendulum, state))
     unit = State(1.0, 1.0, (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * rate, pendulum.m2 * pendulum.l2**2 * rate)
 
     def slope(time, scaled, pendulum):  # type: ignore[no-untyped-def]

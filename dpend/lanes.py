@@ -1,0 +1,142 @@
+"""Many at once: a function of one state mapped over lanes, in blocks, on all CPU devices.
+
+Not for users: `sweep` and the scans of `atlas` call it. It is the one place that knows what makes many trajectories
+fast on a CPU, which is three things. Lanes go in blocks of a width at which XLA makes vector code of every operation
+and a block's whole state stays in the first-level cache; each block runs its time loop to the end before the next one
+starts; and the blocks are dealt to all CPU devices. On any other backend the same call is one `jax.vmap`.
+
+A launch is a fixed number of blocks, of which only as many run as there are lanes for, so that one compiled program
+serves any number of lanes, and every lane's bits are the same whatever number of lanes, launches or devices there are.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as Spec
+from jax.tree_util import PyTreeDef
+
+from dpend.pendulum import Scalar
+
+# Lanes in a block. Measured (experiments/sweep_speed.py): at 32 or fewer LLVM unrolls the loops over lanes before it
+# looks for vectors in them and finds few, three times slower; at 128 order 8 outgrows the cache, a fifth slower.
+WIDTH = 64
+# Blocks a device takes in one launch: enough that the millisecond of starting one is lost, also for short motions.
+_BLOCKS = 256
+# Launches under way at once: one runs, one waits, so that no device stands still while results are collected.
+_UNDER_WAY = 2
+
+
+def over_lanes(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> Any:
+    """function(shared, one) for every lane `one` of `each`, in order.
+
+    Arguments:
+        function: traceable, from pytrees of float64 scalars to a pytree of scalars (integers below 2^53). One compiled
+            program is kept for each function that equals none before.
+        shared: a pytree of scalars, the same for all lanes.
+        each: a pytree with leaves of shape (n,), n at least 1.
+    Returns:
+        The pytree of results, NumPy arrays of shape (n,).
+    Raises:
+        ValueError: a result is not a scalar.
+    """
+    pieces = list(launches(function, shared, each))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+
+
+def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> Iterator[Any]:
+    """The results of `over_lanes` piece by piece, as they come."""
+    leaves, structure = jax.tree.flatten(each)
+    table = np.stack([np.asarray(leaf, np.float64) for leaf in leaves])
+    shared = jax.tree.map(partial(jnp.asarray, dtype=jnp.float64), shared)
+    kinds = _kinds(function, jax.tree.structure(shared), structure)
+    devices = tuple(jax.local_devices())
+    if devices[0].platform != "cpu":
+        yield _collected(np.asarray(_vmapped(function, shared, structure, table)), kinds)
+        return
+    mesh = Mesh(np.array(devices), ("devices",))
+    size = len(devices) * _BLOCKS * WIDTH
+    under_way: deque[tuple[jax.Array, int]] = deque()
+    for start in range(0, table.shape[1], size):
+        piece = table[:, start : start + size]
+        rows = _blocks(function, structure, mesh, shared, *_dealt(piece, mesh))
+        under_way.append((rows, piece.shape[1]))
+        if len(under_way) == _UNDER_WAY:
+            yield _gathered(*under_way.popleft(), kinds)
+    while under_way:
+        yield _gathered(*under_way.popleft(), kinds)
+
+
+def _dealt(piece: np.ndarray, mesh: Mesh) -> tuple[Any, Any]:
+    """The blocks, dealt to the devices like cards so that all get alike, and how many of its own each has to run."""
+    devices = mesh.devices.size
+    values, lanes = piece.shape
+    filled = np.empty((values, devices * _BLOCKS * WIDTH))
+    filled[:, :lanes], filled[:, lanes:] = piece, piece[:, -1:]  # short blocks repeat the last lane
+    counts = (-(-lanes // WIDTH) + devices - 1 - np.arange(devices)) // devices
+    place = NamedSharding(mesh, Spec("devices"))
+    hands = filled.reshape(values, _BLOCKS, devices, WIDTH).transpose(2, 1, 0, 3)
+    return jax.device_put(hands, place), jax.device_put(counts, place)
+
+
+def _gathered(rows: jax.Array, lanes: int, kinds: Any) -> Any:
+    table = np.asarray(rows).transpose(2, 1, 0, 3)  # values, blocks, devices, width
+    return _collected(table.reshape(table.shape[0], -1)[:, :lanes], kinds)
+
+
+def _collected(table: np.ndarray, kinds: Any) -> Any:
+    """The table's rows as the tree that the function gives, each of its own kind."""
+    leaves, structure = jax.tree.flatten(kinds)
+    return jax.tree.unflatten(structure, [row.astype(kind.dtype) for row, kind in zip(table, leaves, strict=True)])
+
+
+@lru_cache(maxsize=64)
+def _kinds(function: Callable[[Any, Any], Any], shared: PyTreeDef, each: PyTreeDef) -> Any:
+    """The tree of shapes and types that the function gives."""
+    scalar = jax.ShapeDtypeStruct((), jnp.float64)
+    trees = (jax.tree.unflatten(tree, [scalar] * tree.num_leaves) for tree in (shared, each))
+    kinds = jax.eval_shape(function, *trees)
+    for path, kind in jax.tree_util.tree_leaves_with_path(kinds):
+        if kind.shape != ():
+            raise ValueError(
+                f"each value of a quantity must be a scalar, got shape {kind.shape} for {jax.tree_util.keystr(path)}: "
+                "return its components under names of their own"
+            )
+    return kinds
+
+
+def _row_by_row(function: Callable[[Any, Any], Any], shared: Any, each: PyTreeDef, table: jax.Array) -> jax.Array:
+    """Values in rows, lanes in columns, in and out: XLA copies several arrays whole where it updates one in place."""
+    mapped = jax.vmap(function, in_axes=(None, 0))(shared, jax.tree.unflatten(each, list(table)))
+    return jnp.stack([leaf.astype(jnp.float64) for leaf in jax.tree.leaves(mapped)])
+
+
+_vmapped = jax.jit(_row_by_row, static_argnums=(0, 2))
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _blocks(
+    function: Callable[[Any, Any], Any], each: PyTreeDef, mesh: Mesh, shared: Any, hands: jax.Array, counts: jax.Array
+) -> jax.Array:
+    def on_one_device(shared: Any, hand: jax.Array, count: jax.Array) -> jax.Array:
+        def block(index: Scalar, done: jax.Array) -> jax.Array:
+            values = _row_by_row(function, shared, each, hand[0, index])
+            return lax.dynamic_update_index_in_dim(done, values, index, 0)
+
+        return lax.fori_loop(0, count[0], block, jnp.zeros((_BLOCKS, rows, WIDTH)))[None]
+
+    rows = len(jax.tree.leaves(_kinds(function, jax.tree.structure(shared), each)))
+    spread = jax.shard_map(
+        on_one_device,
+        mesh=mesh,
+        in_specs=(Spec(), Spec("devices"), Spec("devices")),
+        out_specs=Spec("devices"),
+        check_vma=False,
+    )
+    return spread(shared, hands, counts)
