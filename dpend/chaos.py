@@ -170,24 +170,27 @@ def spectrum(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     """
     size = norm(pendulum)
 
+    def orthogonal(index: Scalar, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        rows, lengths = both
+        above = jnp.where(jnp.arange(4)[:, None] < index, rows, 0.0)
+        row = rows[index] - (above @ rows[index]) @ above
+        length = jnp.sqrt(row @ row)
+        return rows.at[index].set(row / length), lengths.at[index].set(length)
+
     def update(carry, time, dt, state, tangents):  # type: ignore[no-untyped-def]
         logs, steps = carry
         rows = jnp.stack(
             [tangents.theta1, tangents.theta2, size.per_unit1 * tangents.p1, size.per_unit2 * tangents.p2], axis=1
         )
-        lengths, kept = [], []
-        for row in rows:
-            for other in kept:
-                row = row - (other @ row) * other
-            lengths.append(jnp.sqrt(row @ row))
-            kept.append(row / lengths[-1])
-        columns = jnp.stack(kept).T
+        # A loop, although of four turns: written out, XLA computes the chain again for each of its results.
+        basis, lengths = lax.fori_loop(0, 4, orthogonal, (rows, jnp.zeros(4)))
+        columns = basis.T
         tangents = State(columns[0], columns[1], columns[2] / size.per_unit1, columns[3] / size.per_unit2)
-        return (logs + jnp.log(jnp.stack(lengths)), steps + 1.0), tangents
+        return (logs + jnp.log(lengths), steps + 1.0), tangents
 
     basis = np.eye(4)
     start = State(basis[0], basis[1], basis[2] / size.per_unit1, basis[3] / size.per_unit2)
-    logs, steps = fold(update, (jnp.zeros(4), 0.0), pendulum, state, duration, scheme, tangents=start)
+    logs, steps = fold(update, (jnp.zeros(4), jnp.asarray(0.0)), pendulum, state, duration, scheme, tangents=start)
     return {f"exponent{i + 1}": logs[i] / duration for i in range(4)} | {"steps": steps.astype(int)}
 
 
@@ -220,7 +223,8 @@ def megno(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) 
         return (weighted, mean, square * jnp.where(large, _SCALE_BACK**2, 1.0), steps + 1.0), tangent
 
     start = size.vector(*_GENERIC)
-    init = (0.0, 0.0, size.square(start), 0.0)
+    zero = jnp.asarray(0.0)
+    init = (zero, zero, size.square(start), zero)
     _, mean, _, steps = fold(update, init, pendulum, state, duration, scheme, tangents=start)
     return {"megno": mean / duration, "steps": steps.astype(int)}
 

@@ -220,7 +220,12 @@ def _unevenly(update, pendulum, state, along, duration, scheme):  # type: ignore
     rest = duration - along.point.time
     constants = scheme.evenly.constants(pendulum, rest)
     land = _stepper(update, scheme.evenly, constants)
-    along = land(along._replace(point=along.point.circle), lambda _: (duration, rest))
+
+    def once(both: tuple[_Along, Scalar]) -> tuple[_Along, Scalar]:
+        return land(both[0], lambda _: (duration, rest)), jnp.zeros_like(both[1])
+
+    # A loop of at most one turn: as straight code XLA fuses the twelve stages into each of their results, each anew.
+    along, _ = lax.while_loop(lambda both: both[1], once, (along._replace(point=along.point.circle), ~(rest == 0)))
     return scheme.evenly.leave(constants, along.point), along.tangents, along.carry
 
 
