@@ -4,6 +4,9 @@ Angles in radians, SI units. The public names are those below; each module's pag
 """
 
 from dpend import _runtime as _runtime  # sets JAX up: before anything else
+from dpend import chaos as chaos
+from dpend.events import Crossing as Crossing
+from dpend.events import first_crossing as first_crossing
 from dpend.orbits import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits import find_orbit as find_orbit
 from dpend.pendulum import BobEnergies as BobEnergies
@@ -25,6 +28,8 @@ from dpend.stability import monodromy as monodromy
 from dpend.stability import multipliers as multipliers
 from dpend.stability import stability_class as stability_class
 from dpend.steppers import Scheme as Scheme
+from dpend.steppers import scheme_for as scheme_for
+from dpend.sweeps import sweep as sweep
 from dpend.trajectory import Status as Status
 from dpend.trajectory import Trajectory as Trajectory
 from dpend.trajectory import flow as flow

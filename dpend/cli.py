@@ -4,13 +4,16 @@ Exit status 0: done. 1: ran, but some solve failed, or the environment is wrong.
 error. 130: interrupted.
 """
 
+import contextlib
 import csv
 import json
 import math
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +24,7 @@ import typer
 import dpend
 from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
+from dpend.steppers import METHODS
 from dpend.trajectory import Status, Trajectory
 
 app = typer.Typer(
@@ -148,11 +152,136 @@ def simulate(
     return 0 if int(motion.status) == Status.CONVERGED else 1
 
 
+@app.command(name="map")
+def map_command(
+    quantity: Annotated[str, typer.Argument(help="lyapunov, megno, flip or drift.")],
+    size: Annotated[str, typer.Option(metavar="N|NxM", help="Cells along theta1 and theta2.")],
+    duration: Annotated[float, _numeric(help="How long each motion lasts [s].")],
+    out: Annotated[Path, typer.Option(help="The Zarr store; one left unfinished by the same command is finished.")],
+    theta1: Annotated[str, typer.Option(metavar="A:B", help="Range of theta1 [deg].")] = "-180:180",
+    theta2: Annotated[str, typer.Option(metavar="A:B", help="Range of theta2 [deg].")] = "-180:180",
+    tolerance: Annotated[
+        float | None, _numeric(help="Wanted error of the angles [rad]; 1e-6 if no method is given either.")
+    ] = None,
+    method: Annotated[str | None, typer.Option(help=f"One of {', '.join(METHODS)}, with --step.")] = None,
+    step: Annotated[float | None, _numeric(help="Step [s], with --method.")] = None,
+    error: Annotated[
+        str | None, typer.Option(help="half-step: a second pass at half the step, and an error for each cell.")
+    ] = None,
+    figure: Annotated[Path | None, typer.Option(help="Draw the map into P.png.")] = None,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """A map of the square of releases from rest: chaos, first flips or energy drift, cell by cell."""
+    if quantity not in _MAPS:
+        raise ValueError(f"map must be one of {', '.join(_MAPS)}, got {quantity!r}")
+    duration = number("duration", duration, positive=True, unit="s")
+    axes = {
+        key: _cells(key, text, count)
+        for key, text, count in zip(("theta1", "theta2"), (theta1, theta2), _size(size), strict=True)
+    }
+    if figure is not None and (figure.suffix != ".png" or not figure.parent.is_dir()):
+        raise ValueError(f"figure must be a .png in a directory that exists, got {figure}: give another name")
+    started, counts = time.perf_counter(), [0, 0, 0]
+    with _bar(sys.stderr.isatty()) as show:
+
+        def tell(*now: int) -> None:
+            counts[:] = now
+            show(*now)
+
+        field = dpend.sweep(
+            partial(_MAPS[quantity], duration=float(duration)),
+            Pendulum(l1, l2, m1, m2, g),
+            axes,
+            tolerance=tolerance,
+            method=method,
+            step=step,
+            error=error,
+            store=out,
+            progress=tell,
+        )
+    seconds = time.perf_counter() - started
+    status = field["status"].values
+    record = {
+        "cells": int(status.size),
+        "done": int(np.sum(status != Status.NOT_COMPUTED)),
+        "failed": int(np.sum((status != Status.NOT_COMPUTED) & (status != Status.CONVERGED))),
+        "seconds": seconds,
+        "steps_per_second": counts[2] / seconds,
+        "scheme": {"method": field.attrs["method"], "step_s": field.attrs["step"]},
+        "out": str(out),
+    }
+    if figure is not None:
+        _draw(field, figure)
+    if as_json:
+        _print_json(record)
+    else:
+        print(f"{record['cells']} cells in {seconds:.1f} s, {record['failed']} failed", end="; ")
+        print(f"{record['steps_per_second']:.3g} steps/s of {field.attrs['method']}, {field.attrs['step']:.4g} s")
+        print(f"written to {out}" + (f", drawn in {figure}" if figure else ""))
+    return 0
+
+
 # --- what is read ----------------------------------------------------------------------------------------------------
 
 
 def _radians(name: str, degrees: float) -> float:
     return math.radians(number(name, degrees, unit="deg"))
+
+
+_MAPS = {
+    "lyapunov": dpend.chaos.lyapunov,
+    "megno": dpend.chaos.megno,
+    "flip": dpend.chaos.flip,
+    "drift": dpend.chaos.drift,
+}
+
+
+def _size(text: str) -> tuple[int, int]:
+    sides = text.lower().split("x")
+    if len(sides) > 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
+        raise ValueError(f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like 512x256")
+    return int(sides[0]), int(sides[-1])
+
+
+def _cells(name: str, text: str, count: int) -> np.ndarray:
+    """The centres [rad] of `count` cells of a range A:B [deg]; a symmetric range is one half and its mirror image."""
+    try:
+        start, end = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise ValueError(f"{name} must be a range A:B in degrees, got {text!r}: give one like -180:180") from None
+    if not (math.isfinite(start) and math.isfinite(end) and start < end):
+        raise ValueError(f"{name} must be a range A:B with A below B, got {text!r}: give one like -180:180")
+    centres = np.radians(start + (np.arange(count) + 0.5) * ((end - start) / count))
+    return 0.5 * (centres - centres[::-1]) if start == -end else centres
+
+
+@contextlib.contextmanager
+def _bar(shown: bool) -> Iterator[Callable[[int, int, int], None]]:
+    """A progress bar on standard error, with the rate in steps per second and the time left."""
+    if not shown:
+        yield lambda done, cells, steps: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.completed:.0f}/{task.total:.0f} cells"),
+        BarColumn(),
+        TextColumn("{task.fields[rate]}"),
+    )
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
+        task, started = progress.add_task("", total=1, rate=""), time.perf_counter()
+
+        def show(done: int, cells: int, steps: int) -> None:
+            millions = steps / max(time.perf_counter() - started, 1e-9) / 1e6
+            progress.update(task, completed=done, total=cells, rate=f"{millions:.1f} M steps/s")
+
+        yield show
 
 
 # --- what is printed -------------------------------------------------------------------------------------------------
@@ -304,6 +433,26 @@ def _write_csv(motion: Trajectory, path: Path) -> None:
 
 def _write_netcdf(motion: Trajectory, path: Path) -> None:
     motion.to_xarray().to_netcdf(path, engine="scipy")
+
+
+def _draw(field: Any, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from dpend import plots
+
+    names = [name for name in field.data_vars if name not in ("steps", "status", "bob")]
+    names = [name for name in names if name != "bob_error"]
+    fig, axes = plt.subplots(1, len(names), figsize=(5.6 * len(names), 4.6), layout="constrained", squeeze=False)
+    for name, ax in zip(names, axes[0], strict=True):
+        plots.map_of(field, name, ax)
+    with tempfile.NamedTemporaryFile(prefix=f".{path.name}.", suffix=".png", dir=path.parent, delete=False) as draft:
+        fig.savefig(draft, dpi=200)
+    os.chmod(draft.name, 0o644)
+    os.replace(draft.name, path)
+    plt.close(fig)
 
 
 # --- the program -----------------------------------------------------------------------------------------------------

@@ -1,10 +1,10 @@
-"""Pictures of a motion: its path, angles and energies against time, and the rods as a stroboscope sees them.
+"""Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them) and of maps.
 
 Each function draws into the axes it is given, or into new ones, and returns them; saving is the caller's. Colours are
 from Okabe and Ito's palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion for the lower.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -115,3 +115,83 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit]) -> "Figure":
         row[1].set_title(f"({np.degrees(orbit.theta1):.4f}, {np.degrees(orbit.theta2):.4f}) deg", fontsize="medium")
         row[2].set_title(f"T = {period:.6f} s, {orbit.stability}", fontsize="medium")
     return fig
+
+
+# What a map's colour bar says, and whether its values span decades.
+_LABELS = {
+    "lyapunov": ("Lyapunov exponent (1/s)", False),
+    "exponent": ("Lyapunov exponent (1/s)", False),
+    "megno": ("time-averaged MEGNO", False),
+    "flip_time": ("time of the first flip (s)", True),
+    "energy_drift": ("energy drift (of its scale)", True),
+}
+
+
+def map_of(dataset: Any, name: str | None = None, ax: "Axes | None" = None) -> "Axes":
+    """One value of a two-dimensional sweep in colours, its first axis to the right, its second upwards.
+
+    Angles are in degrees. Values over decades (errors, drifts, times) have a logarithmic scale. Cells without a finite
+    value are white: failed ones, and on a flip map those that do not flip; there a line bounds the releases that lack
+    the energy for it.
+
+    Arguments:
+        dataset: what `sweep` returned.
+        name: which value; the first one by default.
+    Raises:
+        ValueError: the dataset has not two dimensions, or no such value.
+    """
+    import matplotlib.colors
+    from matplotlib.ticker import MultipleLocator
+
+    name = name or next(iter(dataset.data_vars))
+    if name not in dataset.data_vars:
+        raise ValueError(f"name must be one of {', '.join(dataset.data_vars)}, got {name!r}")
+    field = dataset[name]
+    if field.ndim != 2:
+        raise ValueError(f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve")
+    ax = _axes(ax)
+    across, up = field.dims
+    label, decades = _LABELS.get(name, (name, name.endswith("_error")))
+    values = np.asarray(field.values, np.float64).T
+    values = np.where(np.isfinite(values), values, np.nan)
+    # Quantiles: a few extreme cells would leave no colour to the others.
+    positive = values[np.isfinite(values) & (values > 0)] if decades else values[np.isfinite(values)]
+    low, high = np.quantile(positive, [0.005, 0.995]) if positive.size else (0.1, 1.0)
+    scale = matplotlib.colors.LogNorm if decades else matplotlib.colors.Normalize
+    norm = scale(low, max(high, low + 0.01 * abs(low)))
+    values = np.where(values <= 0, low, values) if decades else values
+    x, y = (_shown(dataset, key) for key in (across, up))
+    mesh = ax.pcolormesh(x, y, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True)
+    assert ax.figure is not None
+    ax.figure.colorbar(mesh, ax=ax, label=label, extend="both")
+    for key, axis in ((across, ax.xaxis), (up, ax.yaxis)):
+        if key.startswith("theta"):
+            axis.set_label_text(f"{key} (deg)")
+            span = np.ptp(_shown(dataset, key))
+            if span > 180:
+                axis.set_major_locator(MultipleLocator(90 if span > 270 else 45))
+        else:
+            axis.set_label_text(f"{key} ({dataset[key].attrs.get('units', '')})")
+    if name == "flip_time" and {across, up} == {"theta1", "theta2"}:
+        _no_flip(dataset, ax, across)
+    if {across, up} == {"theta1", "theta2"}:
+        ax.set_aspect("equal")
+    return ax
+
+
+def _shown(dataset: Any, key: str) -> np.ndarray:
+    values = np.asarray(dataset[key].values)
+    return np.degrees(values) if key.startswith("theta") else values
+
+
+def _no_flip(dataset: Any, ax: "Axes", across: str) -> None:
+    """The line inside which releases from rest lie below both saddles in which one rod points upwards."""
+    at = dataset.attrs
+    if at.get("at_p1") or at.get("at_p2") or not at["g"] > 0:
+        return
+    weight1, weight2 = (at["m1"] + at["m2"]) * at["l1"], at["m2"] * at["l2"]
+    theta1, theta2 = (_shown(dataset, key) for key in ("theta1", "theta2"))
+    height = -weight1 * np.cos(np.radians(theta1))[:, None] - weight2 * np.cos(np.radians(theta2))[None, :]
+    saddle = -abs(weight1 - weight2)
+    arguments = (theta1, theta2, height.T) if across == "theta1" else (theta2, theta1, height)
+    ax.contour(*arguments, levels=[saddle], colors="black", linewidths=1.0)

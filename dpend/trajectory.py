@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike
 
 from dpend._runtime import require_float64
 from dpend.pendulum import Pendulum, Scalar, State, energy_scale, fast_frequency, hamiltonian, number, vector_field
-from dpend.steppers import Point, Scheme
+from dpend.steppers import METHODS, Point, Scheme
 from dpend.trig import LARGEST_ANGLE
 
 Carry = TypeVar("Carry")
@@ -401,7 +401,7 @@ def simulate(
         pendulum, state: leaves are scalars.
         duration: time [s]; negative runs backwards.
         step: largest step [s]. Without it the step is chosen for `tolerance`.
-        method: `rk4` or `rk8`; the default needs ten times fewer evaluations than `rk4` at an error of 1e-9.
+        method: any with even steps; the default needs ten times fewer evaluations than `rk4` at an error of 1e-9.
         tolerance: wanted error of the angles [rad] at the worst time; 1e-9 if neither it nor a step is given. If no
             step reaches it, because the motion is chaotic and too long, the status is `BEYOND_HORIZON`.
         save_every: every how many steps a state is saved; the last state always is.
@@ -424,6 +424,8 @@ def simulate(
     if isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
         raise ValueError(f"save_every must be an integer of at least 1, got {save_every!r}")
     drift_tolerance = number("drift_tolerance", drift_tolerance, positive=True)
+    if method in METHODS and not Scheme(method, 1.0).even:
+        raise ValueError(f"method must take even steps to save states at, got {method!r}: give rk8-circle, or use flow")
     state = _float64(state)
     wanted = np.float64(_PARTED)
     if step is None:

@@ -1,0 +1,598 @@
+"""A quantity over a grid, as a labelled dataset, in memory or streamed into a Zarr store that can be resumed.
+
+The grid is cut into tiles, one chunk of the store each. A tile is computed as a whole, its values are written and
+synced to disk, and only then its status: whatever moment the process is killed at, the same call finishes the map with
+the bytes that an uninterrupted run would have given.
+"""
+
+import hashlib
+import inspect
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dpend._runtime import require_float64
+from dpend.lanes import launches, over_lanes
+from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
+from dpend.steppers import Scheme, scheme_for
+from dpend.trajectory import Status
+
+# (pendulum, state, scheme) -> named scalars.
+Quantity = Callable[[Pendulum, State, Scheme], Mapping[str, Scalar]]
+
+# Cells along the side of a tile: 65536 cells make a file of some 500 kB for each value, and a second or so of work.
+_TILE = 256
+_UNITS = {
+    "l1": "m",
+    "l2": "m",
+    "m1": "kg",
+    "m2": "kg",
+    "g": "m s-2",
+    "theta1": "rad",
+    "theta2": "rad",
+    "p1": "kg m2 s-1",
+    "p2": "kg m2 s-1",
+    "lyapunov": "s-1",
+    "exponent": "s-1",
+    "uncertainty": "s-1",
+    "flip_time": "s",
+}
+_STATE = tuple(field.name for field in fields(State))
+_PENDULUM = tuple(field.name for field in fields(Pendulum))
+# Cells whose mirror images are computed too, to see what the mirror does to a quantity.
+_SAMPLES = 64
+# The default tolerance [rad]: a map's colours need no more.
+_TOLERANCE = 1e-6
+
+
+def sweep(
+    quantity: Quantity,
+    pendulum: Pendulum,
+    axes: Mapping[str, Any],
+    *,
+    at: Mapping[str, float] | None = None,
+    tolerance: float | None = None,
+    method: str | None = None,
+    step: float | None = None,
+    error: str | None = None,
+    mirror: bool = True,
+    store: str | os.PathLike[str] | None = None,
+    name: str | None = None,
+    progress: Callable[[int, int, int], None] | None = None,
+) -> Any:
+    """A quantity over one or two fields of `State` or `Pendulum`.
+
+    Reflection takes theta and p to -theta and -p, and the arithmetic follows it to the last bit. Where the grid is
+    symmetric and the values of a sample of cells are, to the last bit, those of their mirror images or their negatives,
+    one half of the cells is computed and the other mirrored.
+
+    Arguments:
+        quantity: (pendulum, state, scheme) -> dict of scalars, traceable in the first two; settings by keyword, as
+            functools.partial(dpend.chaos.lyapunov, duration=10.0).
+        pendulum: the parameters that are no axis.
+        axes: one or two fields of `State` [rad, kg m^2/s] or `Pendulum` [SI], each with its values, shape (n,); the
+            dataset's dimensions are in this order.
+        at: the other fields of the state; zero by default.
+        tolerance: wanted error [rad] of the angles; the method and step are those of `scheme_for`. 1e-6 by default.
+        method, step: both, instead of a tolerance.
+        error: "half-step" makes a second pass at half the step and adds |h - h/2| of each value as <name>_error.
+        mirror: False computes every cell, also of symmetric maps.
+        store: a directory for a Zarr store. One left unfinished by a run with the same settings is finished; what is
+            returned is opened lazily.
+        name: of the quantity in the store, needed where it is a lambda or a closure.
+        progress: called with cells done, cells in all, and steps taken by this call, after every piece of work.
+    Returns:
+        xarray.Dataset: the quantity's values, `status` (a value of `Status` for each cell: NONFINITE where a value is
+        NaN), coordinates with units, angles also in degrees, and as attributes all that determines the values.
+    Raises:
+        ValueError: bad axes, tolerance or method; a store made with other settings, or a directory that is none.
+        RuntimeError: a store made by another version of this package; float64 is switched off in JAX.
+    """
+    require_float64()
+    grid = _Grid.checked(pendulum, axes, at or {})
+    scheme = _scheme(grid, tolerance, method, step)
+    if error not in (None, "half-step"):
+        raise ValueError(f'error must be None or "half-step", got {error!r}')
+    task = _Task(_Keyed.of(quantity), grid, scheme, error is not None, mirror)
+    if store is None:
+        return _labelled(task, _computed(task, progress), task.attributes(name, strict=False))
+    return _stored(task, Path(store), task.attributes(name, strict=True), progress)
+
+
+# --- what is asked ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Keyed:
+    """A quantity that equals any other of the same function and settings, so that compiled code is found again."""
+
+    function: Quantity
+    arguments: tuple[Any, ...]
+    keywords: tuple[tuple[str, Any], ...]
+
+    @staticmethod
+    def of(quantity: Quantity) -> "_Keyed":
+        if not isinstance(quantity, partial):
+            return _Keyed(quantity, (), ())
+        return _Keyed(quantity.func, quantity.args, tuple(sorted(quantity.keywords.items())))
+
+    def __call__(self, *args: Any) -> Mapping[str, Scalar]:
+        return self.function(*self.arguments, *args, **dict(self.keywords))
+
+    def identity(self, name: str | None, strict: bool) -> dict[str, str]:
+        """Module, name, keywords and a hash of the source.
+
+        Raises:
+            ValueError: with `strict`, a lambda or closure without a name, or settings that text cannot hold.
+        """
+        inner = inspect.unwrap(self.function)
+        own = getattr(inner, "__qualname__", type(inner).__qualname__)
+        nameless = "<" in own or getattr(inner, "__closure__", None)
+        if strict and nameless and name is None:
+            raise ValueError(f"name must be given to store a lambda or a closure, got {own}: say what it computes")
+        try:
+            settings = json.dumps([self.arguments, dict(self.keywords)], allow_nan=False)
+        except (TypeError, ValueError):
+            if strict and name is None:
+                raise ValueError(
+                    f"name must be given to store a quantity with settings that are no plain numbers or text, "
+                    f"got {dict(self.keywords)}: say what it computes"
+                ) from None
+            settings = "see the name"
+        try:
+            source = inspect.getsource(inner)
+        except (OSError, TypeError):
+            source = ""
+        return {
+            "quantity": name or f"{getattr(inner, '__module__', '')}.{own}",
+            "quantity_settings": settings,
+            "quantity_source_sha256": hashlib.sha256(source.encode()).hexdigest(),
+        }
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """The cells: fields of the state or the pendulum along one or two axes, the rest fixed."""
+
+    pendulum: Pendulum
+    axes: dict[str, np.ndarray]
+    at: dict[str, float]
+
+    @staticmethod
+    def checked(pendulum: Pendulum, axes: Mapping[str, Any], at: Mapping[str, float]) -> "_Grid":
+        if not 1 <= len(axes) <= 2:
+            raise ValueError(f"axes must be one or two, got {len(axes)}: {list(axes)}")
+        for key in [*axes, *at]:
+            if key not in _STATE + _PENDULUM:
+                raise ValueError(f"axes and at must be fields of State or Pendulum, got {key!r}: {', '.join(_UNITS)}")
+        twice = [key for key in at if key in axes or key in _PENDULUM]
+        if twice:
+            raise ValueError(f"at must name fields of State that are no axis, got {twice[0]!r}: leave it out")
+        values = {}
+        for key, given in axes.items():
+            array = np.asarray(given, np.float64)
+            if array.ndim != 1 or not array.size or not np.all(np.isfinite(array)):
+                raise ValueError(f"axis {key} must be a one-dimensional array of finite numbers, got {given!r}")
+            if key in ("l1", "l2", "m1", "m2") and np.any(array <= 0):
+                raise ValueError(f"axis {key} must be positive, got {array.min():g}: leave that out")
+            values[key] = array
+        if not all(isinstance(getattr(pendulum, field), np.floating) for field in _PENDULUM):
+            raise ValueError("pendulum must have numbers for fields: name those that vary as axes")
+        rest = {field: 0.0 for field in _STATE if field not in values}
+        return _Grid(pendulum, values, rest | {key: float(number(key, value)) for key, value in at.items()})
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(array.size for array in self.axes.values())
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether reflecting a cell's state gives another cell's: then that is the one at the other end of the axes."""
+        moving = [array for key, array in self.axes.items() if key in _STATE]
+        still = all(value == 0.0 for value in self.at.values())
+        return bool(moving) and still and all(np.array_equal(array, -array[::-1]) for array in moving)
+
+    def reflected(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
+        """The block of mirror images of a block of cells."""
+        return tuple(
+            slice(size - part.stop, size - part.start) if key in _STATE else part
+            for (key, size), part in zip(zip(self.axes, self.shape, strict=True), block, strict=True)
+        )
+
+    def turned(self, values: np.ndarray) -> np.ndarray:
+        """A block of values in the order of their mirror images."""
+        return np.flip(values, tuple(axis for axis, key in enumerate(self.axes) if key in _STATE))
+
+    def tiles(self) -> Iterator[tuple[slice, ...]]:
+        tile = self.tile()
+        for corner in np.ndindex(*(-(-size // side) for size, side in zip(self.shape, tile, strict=True))):
+            yield tuple(
+                slice(index * side, min((index + 1) * side, size))
+                for index, side, size in zip(corner, tile, self.shape, strict=True)
+            )
+
+    def tile(self) -> tuple[int, ...]:
+        """A tile's shape: of symmetric axes an even number fits, so that whole tiles are mirror images of others."""
+        side = _TILE if len(self.axes) == 2 else _TILE**2
+        return tuple(min(side, max(1, -(-size // 2)) if self.symmetric else size) for size in self.shape)
+
+    def lanes(self, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
+        """The axes' values of every cell of a block, flat."""
+        parts = [array[part] for array, part in zip(self.axes.values(), block, strict=True)]
+        return {key: mesh.ravel() for key, mesh in zip(self.axes, np.meshgrid(*parts, indexing="ij"), strict=True)}
+
+
+def _placed(pendulum: Pendulum, at: Mapping[str, Scalar], cell: Mapping[str, Scalar]) -> tuple[Pendulum, State]:
+    pendulum = replace(pendulum, **{key: value for key, value in cell.items() if key in _PENDULUM})
+    return pendulum, State(**{key: cell.get(key, at.get(key)) for key in _STATE})
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """What is computed in each lane: a value, so that equal sweeps share their compiled code."""
+
+    quantity: _Keyed
+    scheme: Scheme
+    twice: bool
+
+    def __call__(self, shared: tuple[Pendulum, dict[str, Scalar]], cell: dict[str, Scalar]) -> dict[str, Scalar]:
+        pendulum, state = _placed(*shared, cell)
+        values = dict(self.quantity(pendulum, state, self.scheme))
+        taken = values.get("steps", 0)
+        if self.twice:
+            finer = self.quantity(pendulum, state, replace(self.scheme, step=self.scheme.step / 2))
+            taken = taken + finer.get("steps", 0)
+            for key in [key for key, value in values.items() if jax.numpy.issubdtype(value.dtype, np.floating)]:
+                difference = jax.numpy.abs(values[key] - finer[key])
+                values[f"{key}_error"] = jax.numpy.where(values[key] == finer[key], 0.0, difference)
+        return values | {_TAKEN: jax.numpy.asarray(taken)}
+
+
+# The attribute by which xarray knows a store's further coordinates.
+_DEGREES = "coordinates"
+# The steps of both passes, for the rate; no part of the result.
+_TAKEN = "steps taken"
+
+
+@jax.jit
+def _energy(pendulum: Pendulum, at: dict[str, Scalar], cell: dict[str, Scalar]) -> Scalar:
+    shape = next(iter(cell.values())).shape
+    pendulum, state = _placed(pendulum, {key: jax.numpy.full(shape, value) for key, value in at.items()}, cell)
+    return hamiltonian(pendulum, state) * jax.numpy.ones(shape)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """All that determines a sweep's values."""
+
+    quantity: _Keyed
+    grid: _Grid
+    scheme: Scheme
+    twice: bool
+    mirror: bool
+
+    @property
+    def cell(self) -> _Cell:
+        return _Cell(self.quantity, replace(self.scheme, written_out=True), self.twice)
+
+    @property
+    def shared(self) -> tuple[Pendulum, dict[str, float]]:
+        return self.grid.pendulum, self.grid.at
+
+    def attributes(self, name: str | None, strict: bool) -> dict[str, Any]:
+        """Provenance: nothing in it depends on when or on what machine the sweep runs."""
+        import dpend
+
+        axes = hashlib.sha256()
+        for key, array in self.grid.axes.items():
+            axes.update(key.encode() + array.tobytes())
+        return {
+            "dpend_version": dpend.__version__,
+            **self.quantity.identity(name, strict),
+            **{field: float(getattr(self.grid.pendulum, field)) for field in _PENDULUM if field not in self.grid.axes},
+            **{f"at_{key}": value for key, value in self.grid.at.items()},
+            "method": self.scheme.name,
+            "step": self.scheme.step,
+            "error": "half-step" if self.twice else "none",
+            "mirror": "where it holds" if self.mirror else "never",
+            "axes_sha256": axes.hexdigest(),
+            "tile": list(self.grid.tile()),
+        }
+
+
+def _scheme(grid: _Grid, tolerance: float | None, method: str | None, step: float | None) -> Scheme:
+    if method is None and step is None:
+        wanted = float(number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad"))
+        ends = {key: (array.min(), array.max()) for key, array in grid.axes.items() if key in _PENDULUM}
+        corners = np.array(np.meshgrid(*ends.values())).reshape(len(ends), -1).T if ends else [()]
+        schemes = [
+            scheme_for(replace(grid.pendulum, **dict(zip(ends, map(float, corner), strict=True))), wanted)
+            for corner in corners
+        ]
+        return min(schemes, key=lambda scheme: scheme.step)  # the fastest pendulum's
+    if tolerance is not None:
+        raise ValueError(f"tolerance excludes method and step, got {tolerance}: give either")
+    if method is None or step is None:
+        given, missing = ("step", "method") if method is None else ("method", "step")
+        raise ValueError(f"{missing} must be given with {given}, got {given} alone: or give a tolerance")
+    return Scheme(method, step)
+
+
+# --- computing -------------------------------------------------------------------------------------------------------
+
+
+def _parities(task: _Task) -> dict[str, int] | None:
+    """1 for values that a cell shares with its mirror image, -1 for its negative; None if any is neither.
+
+    The reflection of a state follows the motion to the last bit, so a sample decides: values that do not keep the
+    symmetry differ in some cell.
+    """
+    if not (task.mirror and task.grid.symmetric):
+        return None
+    cells = int(np.prod(task.grid.shape))
+    picked = np.unique(np.linspace(0, cells - 1, _SAMPLES + 1).astype(int)[:-1] * 7919 % cells)
+    index = np.unravel_index(picked, task.grid.shape)
+    here = {key: array[i] for (key, array), i in zip(task.grid.axes.items(), index, strict=True)}
+    there = {key: -array if key in _STATE else array for key, array in here.items()}
+    both = {key: np.concatenate([here[key], there[key]]) for key in here}
+    values = over_lanes(task.cell, task.shared, both)
+    values.pop(_TAKEN)
+    parities = {}
+    for key, array in values.items():
+        first, second = np.split(array, 2)
+        nan = array.dtype.kind == "f"
+        if np.array_equal(first, second, equal_nan=nan):
+            parities[key] = 1
+        elif array.dtype.kind != "b" and np.array_equal(first, -second, equal_nan=nan):
+            parities[key] = -1
+        else:
+            return None
+    return parities
+
+
+def _tile_values(  # type: ignore[no-untyped-def]
+    task: _Task, block: tuple[slice, ...], parities: dict[str, int] | None, done, progress
+) -> dict[str, np.ndarray]:
+    """The values and status of a tile's cells; done(block) gives those of any block so far."""
+    grid = task.grid
+    shape = tuple(part.stop - part.start for part in block)
+    compute, own_image = np.ones(shape, bool), np.zeros(shape, bool)
+    known = None if parities is None else done(grid.reflected(block))
+    if parities is not None:
+        places = np.meshgrid(*(np.arange(part.start, part.stop) for part in block), indexing="ij")
+        images = [
+            size - 1 - place if key in _STATE else place
+            for key, size, place in zip(grid.axes, grid.shape, places, strict=True)
+        ]
+        inside = np.all([(part.start <= im) & (im < part.stop) for part, im in zip(block, images, strict=True)], axis=0)
+        later = np.ravel_multi_index(places, grid.shape) > np.ravel_multi_index(images, grid.shape)
+        own_image = inside & later  # of such a pair one is computed
+        compute &= ~own_image
+        if known is not None:
+            known = {key: grid.turned(array) for key, array in known.items()}
+            compute &= known["status"] == Status.NOT_COMPUTED
+            own_image &= known["status"] == Status.NOT_COMPUTED
+    values = _lane_values(task, block, compute, progress)
+    if parities is None:
+        return values
+    for key, array in values.items():
+        parity = parities.get(key, 1)  # the status is even
+        if known is not None:
+            copied = ~compute & ~own_image
+            array[copied] = parity * known[key][copied] if key in parities else known[key][copied]
+        source = tuple(im[own_image] - part.start for im, part in zip(images, block, strict=True))
+        array[own_image] = parity * array[source] if key in parities else array[source]
+    return values
+
+
+def _lane_values(task: _Task, block: tuple[slice, ...], compute: np.ndarray, progress: Any) -> dict[str, np.ndarray]:
+    """The values and status of the cells of a block that are to be computed, arrays of the block's shape."""
+    every = task.grid.lanes(block)
+    chosen = np.flatnonzero(compute)
+    if not task.scheme.even:
+        # A block of lanes takes as long as its slowest: cells of like energy take like numbers of steps.
+        energy = np.asarray(_energy(task.grid.pendulum, task.grid.at, every))
+        chosen = chosen[np.argsort(energy[chosen], kind="stable")]
+    values: dict[str, np.ndarray] = {}
+    at = 0
+    for piece in (
+        launches(task.cell, task.shared, {key: lanes[chosen] for key, lanes in every.items()}) if chosen.size else ()
+    ):
+        taken = int(piece.pop(_TAKEN).sum())
+        own = piece.pop("status", None)
+        bad = np.any([np.isnan(array) for array in piece.values() if array.dtype.kind == "f"], axis=0)
+        piece["status"] = np.where(bad, Status.NONFINITE, Status.CONVERGED if own is None else own).astype(np.uint8)
+        count = piece["status"].size
+        for key, array in piece.items():
+            values.setdefault(key, np.zeros(compute.shape, array.dtype)).ravel()[chosen[at : at + count]] = array
+        at += count
+        progress(count, taken)
+    return values or {key: np.zeros(compute.shape, kind) for key, kind in _kinds(task).items()}
+
+
+def _kinds(task: _Task) -> dict[str, np.dtype]:
+    """The names and types of a sweep's values, the status last."""
+    scalar = jax.ShapeDtypeStruct((), np.float64)
+    shared = jax.tree.map(lambda _: scalar, task.shared)
+    kinds = dict(jax.eval_shape(task.cell, shared, dict.fromkeys(task.grid.axes, scalar)))
+    del kinds[_TAKEN]
+    kinds.pop("status", None)
+    return {key: np.dtype(kind.dtype) for key, kind in kinds.items()} | {"status": np.dtype(np.uint8)}
+
+
+class _Progress:
+    """Counts cells and steps, and tells the caller."""
+
+    def __init__(self, task: _Task, tell: Callable[[int, int, int], None] | None):
+        self.cells, self.steps, self.all, self.tell = 0, 0, int(np.prod(task.grid.shape)), tell
+
+    def __call__(self, cells: int, steps: int) -> None:
+        self.cells, self.steps = self.cells + cells, self.steps + steps
+        if self.tell is not None:
+            self.tell(self.cells, self.all, self.steps)
+
+
+def _computed(task: _Task, tell: Callable[[int, int, int], None] | None) -> dict[str, np.ndarray]:
+    """All values in memory."""
+    progress, parities = _Progress(task, tell), _parities(task)
+    values = {key: np.zeros(task.grid.shape, kind) for key, kind in _kinds(task).items()}
+    values["status"][...] = Status.NOT_COMPUTED
+    for block in task.grid.tiles():
+        before = progress.cells
+        tile = _tile_values(
+            task, block, parities, lambda image: {key: array[image] for key, array in values.items()}, progress
+        )
+        for key, array in tile.items():
+            values[key][block] = array
+        progress(tile["status"].size - (progress.cells - before), 0)
+    return values
+
+
+def _coordinates(grid: _Grid) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
+    coordinates = {}
+    for key, array in grid.axes.items():
+        coordinates[key] = (key, array, {"units": _UNITS[key]})
+        if key.startswith("theta"):
+            coordinates[f"{key}_deg"] = (key, np.degrees(array), {"units": "degree"})
+    return coordinates
+
+
+def _units(key: str) -> dict[str, Any]:
+    unit = _UNITS.get(key.removesuffix("_error"))
+    if key == "status":
+        return {"flag_values": [int(s) for s in Status], "flag_meanings": " ".join(s.name.lower() for s in Status)}
+    return {"units": unit} if unit else {}
+
+
+def _labelled(task: _Task, values: dict[str, np.ndarray], attributes: dict[str, Any]) -> Any:
+    import xarray
+
+    dims = tuple(task.grid.axes)
+    data = {key: (dims, array, _units(key)) for key, array in values.items()}
+    return xarray.Dataset(data, _coordinates(task.grid), attributes)
+
+
+# --- the store -------------------------------------------------------------------------------------------------------
+
+
+def _stored(task: _Task, path: Path, attributes: dict[str, Any], tell: Callable[[int, int, int], None] | None) -> Any:
+    import xarray
+    import zarr
+
+    if not path.exists():
+        _create(task, path, attributes)
+    _check(path, attributes)
+    for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
+        leftover.unlink()
+    group: Any = zarr.open_group(path, mode="r+")
+    kinds = _kinds(task)
+    status = group["status"]
+    progress = _Progress(task, tell)
+    todo = []
+    for block in task.grid.tiles():
+        if np.all(status[block] != Status.NOT_COMPUTED):
+            progress.cells += int(np.prod([part.stop - part.start for part in block]))
+        else:
+            todo.append(block)
+    parities = _parities(task) if todo else None
+    for block in todo:
+        before = progress.cells
+        tile = _tile_values(task, block, parities, lambda image: {key: group[key][image] for key in kinds}, progress)
+        for key, array in tile.items():
+            if key != "status":
+                _write(path, group, key, block, array)
+        _write(path, group, "status", block, tile["status"])
+        progress(tile["status"].size - (progress.cells - before), 0)
+    return xarray.open_zarr(path, consolidated=False, chunks=None)
+
+
+def _write(path: Path, group: Any, key: str, block: tuple[slice, ...], values: np.ndarray) -> None:
+    """Writes one chunk and waits until it is on the disk."""
+    array = group[key]
+    array[block] = values
+    chunk = tuple(part.start // side for part, side in zip(block, array.chunks, strict=True))
+    file = path / key / array.metadata.encode_chunk_key(chunk)
+    for place in (file, *list(file.parents)[: len(chunk) + 1]):
+        _sync(place)
+
+
+def _sync(place: Path) -> None:
+    handle = os.open(place, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _create(task: _Task, path: Path, attributes: dict[str, Any]) -> None:
+    """An empty store, under a temporary name until it is whole."""
+    import zarr
+
+    if not path.parent.is_dir():
+        raise ValueError(f"store must lie in a directory that exists, got {path}: make {path.parent} first")
+    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
+    try:
+        grid = task.grid
+        degrees = " ".join(key for key in _coordinates(grid) if key not in grid.axes)
+        group: Any = zarr.create_group(draft, attributes=attributes | {_DEGREES: degrees})
+        for key, (dim, values, units) in _coordinates(grid).items():
+            array = group.create_array(
+                key,
+                shape=values.shape,
+                dtype=values.dtype,
+                chunks=values.shape,
+                dimension_names=[dim],
+                attributes=units,
+            )
+            array[...] = values
+        for key, kind in _kinds(task).items():
+            group.create_array(
+                key,
+                shape=grid.shape,
+                dtype=kind,
+                chunks=grid.tile(),
+                dimension_names=list(grid.axes),
+                fill_value=int(Status.NOT_COMPUTED) if key == "status" else (math.nan if kind.kind == "f" else 0),
+                attributes=_units(key),
+                config={"write_empty_chunks": True},
+            )
+        for place in (*draft.rglob("*"), draft):
+            _sync(place)
+        os.rename(draft, path)
+        _sync(path.parent)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _check(path: Path, attributes: dict[str, Any]) -> None:
+    """Refuses what is no store, or one of another sweep."""
+    import zarr
+
+    try:
+        found = dict(zarr.open_group(path, mode="r").attrs)
+    except (FileNotFoundError, ValueError, KeyError, NotADirectoryError):
+        raise ValueError(
+            f"store must be a Zarr store of a sweep or a new name, got {path}: give another name"
+        ) from None
+    if found.get("dpend_version") != attributes["dpend_version"]:
+        raise RuntimeError(
+            f"store {path} was made by version {found.get('dpend_version')} of dpend, this is "
+            f"{attributes['dpend_version']}: finish it with that version, or give another name"
+        )
+    wanted = json.loads(json.dumps(attributes))
+    found.pop(_DEGREES, None)
+    for key in {**wanted, **found}:
+        if found.get(key) != wanted.get(key):
+            raise ValueError(
+                f"store {path} holds another sweep, its {key} is {found.get(key)!r}, not {wanted.get(key)!r}: "
+                "give another name"
+            )
