@@ -151,7 +151,9 @@ def map_of(dataset: Any, name: str | None = None, ax: "Axes | None" = None) -> "
         raise ValueError(f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve")
     ax = _axes(ax)
     across, up = field.dims
-    label, decades = _LABELS.get(name, (name, name.endswith("_error")))
+    label, decades = _LABELS.get(name.removesuffix("_error"), (name, False))
+    if name.endswith("_error"):
+        label, decades = f"error: {label}", True
     values = np.asarray(field.values, np.float64).T
     values = np.where(np.isfinite(values), values, np.nan)
     # Quantiles: a few extreme cells would leave no colour to the others.

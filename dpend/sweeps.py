@@ -103,6 +103,7 @@ def sweep(
     if error not in (None, "half-step"):
         raise ValueError(f'error must be None or "half-step", got {error!r}')
     task = _Task(_Keyed.of(quantity), grid, scheme, error is not None, mirror)
+    _kinds(task)  # refuses a quantity that cannot be mapped before anything is computed
     if store is None:
         return _labelled(task, _computed(task, progress), task.attributes(name, strict=False))
     return _stored(task, Path(store), task.attributes(name, strict=True), progress)
@@ -426,6 +427,11 @@ def _kinds(task: _Task) -> dict[str, np.dtype]:
     kinds = dict(jax.eval_shape(task.cell, shared, dict.fromkeys(task.grid.axes, scalar)))
     del kinds[_TAKEN]
     kinds.pop("status", None)
+    taken = [key for key in kinds if key in _STATE + _PENDULUM or key in _coordinates(task.grid)]
+    if taken:
+        raise ValueError(
+            f"a quantity's value must not bear the name of a coordinate, got {taken[0]!r}: call it another"
+        )
     return {key: np.dtype(kind.dtype) for key, kind in kinds.items()} | {"status": np.dtype(np.uint8)}
 
 
@@ -493,34 +499,32 @@ def _stored(task: _Task, path: Path, attributes: dict[str, Any], tell: Callable[
     _check(path, attributes)
     for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
         leftover.unlink()
-    group: Any = zarr.open_group(path, mode="r+")
-    kinds = _kinds(task)
-    status = group["status"]
+    # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
+    arrays = {key: zarr.open_array(path / key, mode="r+", config={"write_empty_chunks": True}) for key in _kinds(task)}
     progress = _Progress(task, tell)
     todo = []
     for block in task.grid.tiles():
-        if np.all(status[block] != Status.NOT_COMPUTED):
+        if np.all(arrays["status"][block] != Status.NOT_COMPUTED):
             progress.cells += int(np.prod([part.stop - part.start for part in block]))
         else:
             todo.append(block)
     parities = _parities(task) if todo else None
     for block in todo:
         before = progress.cells
-        tile = _tile_values(task, block, parities, lambda image: {key: group[key][image] for key in kinds}, progress)
-        for key, array in tile.items():
-            if key != "status":
-                _write(path, group, key, block, array)
-        _write(path, group, "status", block, tile["status"])
+        tile = _tile_values(
+            task, block, parities, lambda image: {key: array[image] for key, array in arrays.items()}, progress
+        )
+        for key in sorted(tile, key=lambda key: key == "status"):  # the status last
+            _write(path / key, arrays[key], block, tile[key])
         progress(tile["status"].size - (progress.cells - before), 0)
     return xarray.open_zarr(path, consolidated=False, chunks=None)
 
 
-def _write(path: Path, group: Any, key: str, block: tuple[slice, ...], values: np.ndarray) -> None:
+def _write(path: Path, array: Any, block: tuple[slice, ...], values: np.ndarray) -> None:
     """Writes one chunk and waits until it is on the disk."""
-    array = group[key]
     array[block] = values
     chunk = tuple(part.start // side for part, side in zip(block, array.chunks, strict=True))
-    file = path / key / array.metadata.encode_chunk_key(chunk)
+    file = path / array.metadata.encode_chunk_key(chunk)
     for place in (file, *list(file.parents)[: len(chunk) + 1]):
         _sync(place)
 
@@ -563,7 +567,6 @@ def _create(task: _Task, path: Path, attributes: dict[str, Any]) -> None:
                 dimension_names=list(grid.axes),
                 fill_value=int(Status.NOT_COMPUTED) if key == "status" else (math.nan if kind.kind == "f" else 0),
                 attributes=_units(key),
-                config={"write_empty_chunks": True},
             )
         for place in (*draft.rglob("*"), draft):
             _sync(place)

@@ -1,0 +1,68 @@
+"""Crossings against closed forms, another integrator, and the method's own order."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import dpend
+from dpend import Pendulum, Scheme
+
+
+def lower(pendulum, state):
+    return state.theta1
+
+
+def both(pendulum, state):
+    return state.theta1, state.theta2
+
+
+@pytest.mark.parametrize("name", ["rk8", "rk8-circle-rescaled"])
+def test_a_simple_pendulum_passes_the_bottom_at_a_quarter_of_its_period(name):
+    """m2 -> 0: 4 K(sin^2(a/2)) sqrt(l/g) is the period."""
+    pendulum = Pendulum(1.0, 0.7, 1.0, 1e-9, 1.0)
+    crossing = dpend.first_crossing(lower, pendulum, dpend.released(2.0, 0.3), 5.0, Scheme(name, 1e-2))
+    assert abs(crossing.time - ellipk(math.sin(1.0) ** 2)) < 1e-8
+    assert abs(crossing.state.theta1) < 1e-12
+    assert crossing.which == 0
+
+
+def test_the_crossing_is_exact_to_the_method(paper):
+    """The error in time falls with the method's order; an interpolant would end it at its own."""
+    start = dpend.released(1.2, 0.4)
+    exact = dpend.first_crossing(lower, paper, start, 0.6, Scheme("rk8", 5e-4)).time
+    steps = np.array([3e-3, 4.5e-3, 6e-3])
+    errors = [abs(dpend.first_crossing(lower, paper, start, 0.6, Scheme("rk4", h)).time - exact) for h in steps]
+    assert abs(np.polyfit(np.log(steps), np.log(errors), 1)[0] - 4) < 0.5
+
+
+def test_the_first_of_two_and_its_direction(paper):
+    start, scheme = dpend.released(1.2, -0.4), Scheme("rk8", 4e-3)
+    earliest = dpend.first_crossing(both, paper, start, 2.0, scheme)
+    alone = dpend.first_crossing(lower, paper, start, 2.0, scheme)
+    assert earliest.which == 1
+    assert earliest.time < alone.time
+    rising = dpend.first_crossing(lower, paper, start, 2.0, scheme, direction=1)
+    falling = dpend.first_crossing(lower, paper, start, 2.0, scheme, direction=-1)
+    assert falling.time == alone.time < rising.time
+    motion = dpend.reference(paper, start, [float(rising.time)])
+    assert abs(motion.state.theta1[-1]) < 1e-9
+    assert dpend.vector_field(paper, rising.state).theta1 > 0
+
+
+def test_backwards_and_never(paper):
+    scheme = Scheme("rk8", 4e-3)
+    start = dpend.flow(paper, dpend.released(0.5, 0.2), 0.1, scheme)
+    there = dpend.first_crossing(lower, paper, start, -1.0, scheme)
+    assert there.time < 0
+    assert abs(dpend.flow(paper, start, float(there.time), scheme).theta1) < 1e-10
+    never = dpend.first_crossing(lower, paper, dpend.released(0.5, 0.2), 0.05, scheme)
+    assert never.time == jnp.inf
+    assert never.which == -1
+
+
+def test_direction_is_checked(paper):
+    with pytest.raises(ValueError, match="direction must be -1, 0 or 1, got 2"):
+        dpend.first_crossing(lower, paper, dpend.released(0.5, 0.2), 1.0, Scheme("rk8", 1e-2), direction=2)

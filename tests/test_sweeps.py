@@ -1,0 +1,213 @@
+"""Maps against a loop over their cells, their symmetry to the last bit, and stores that survive anything."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+import dpend
+from dpend import Pendulum, Status, chaos, sweeps
+
+FLIP = partial(chaos.flip, duration=3.0)
+LYAPUNOV = partial(chaos.lyapunov, duration=2.0)
+SIDE = np.pi * (np.arange(24) + 0.5 - 12) / 12
+
+
+def last(pendulum, state, scheme, *, duration):
+    end = dpend.flow(pendulum, state, duration, scheme)
+    return {"end1": end.theta1, "end2": end.theta2}
+
+
+LAST = partial(last, duration=1.0)
+
+
+@pytest.fixture(scope="module")
+def flips(paper):
+    return dpend.sweep(FLIP, paper, {"theta1": SIDE, "theta2": SIDE})
+
+
+@pytest.fixture(scope="module")
+def ends(paper):
+    return dpend.sweep(LAST, paper, {"theta1": SIDE, "theta2": SIDE}, tolerance=1e-6, error="half-step")
+
+
+def test_a_map_is_the_loop_over_its_cells(paper, ends):
+    """Against diffrax, cell by cell; the error estimate covers what is seen."""
+    for i, j in ((0, 0), (3, 20), (11, 12), (17, 5), (23, 1)):
+        truth = dpend.reference(paper, dpend.released(SIDE[i], SIDE[j]), [1.0], error=False)
+        for key, angle in (("end1", truth.state.theta1), ("end2", truth.state.theta2)):
+            missed = abs(float(ends[key][i, j]) - float(angle[-1]))
+            assert missed < 1e-6
+            assert missed < 2 * float(ends[f"{key}_error"][i, j]) + 1e-9
+
+
+def test_symmetry_is_exact_and_saves_half(paper, ends):
+    """Angles change sign, errors do not; computing every cell gives the same bits."""
+    counted = []
+    whole = dpend.sweep(
+        LAST, paper, {"theta1": SIDE, "theta2": SIDE}, tolerance=1e-6, error="half-step", mirror=False,
+        progress=lambda done, cells, steps: counted.append((done, cells)),
+    )  # fmt: skip
+    for key in ends.data_vars:
+        np.testing.assert_array_equal(ends[key], whole[key])
+    np.testing.assert_array_equal(ends.end1.values, -ends.end1.values[::-1, ::-1])
+    np.testing.assert_array_equal(ends.end1_error.values, ends.end1_error.values[::-1, ::-1])
+    assert counted[-1] == (24 * 24, 24 * 24)
+
+
+def test_a_quantity_without_the_symmetry_is_computed_everywhere(paper):
+    def tilted(pendulum, state, scheme):
+        return {"sum": state.theta1 + 2 * state.theta2 + 1.0}
+
+    field = dpend.sweep(tilted, paper, {"theta1": SIDE, "theta2": SIDE})
+    np.testing.assert_array_equal(field["sum"], SIDE[:, None] + 2 * SIDE[None, :] + 1.0)
+
+
+def test_no_cell_flips_that_lacks_the_energy(flips):
+    able = 2 * np.cos(SIDE)[:, None] + np.cos(SIDE)[None, :] <= 1
+    flipped = np.isfinite(flips.flip_time.values)
+    assert not np.any(flipped & ~able)
+    assert np.sum(flipped) > 100
+    assert np.all((flips.bob.values > 0) == flipped)
+    assert np.all(flips.status == Status.CONVERGED)
+
+
+def test_tiles_and_axes_do_not_change_a_bit(paper, flips, monkeypatch):
+    monkeypatch.setattr(sweeps, "_TILE", 7)
+    tiled = dpend.sweep(FLIP, paper, {"theta1": SIDE, "theta2": SIDE})
+    turned = dpend.sweep(FLIP, paper, {"theta2": SIDE, "theta1": SIDE})
+    for key in flips.data_vars:
+        np.testing.assert_array_equal(flips[key], tiled[key])
+        np.testing.assert_array_equal(flips[key], turned[key].T)
+
+
+def test_axes_of_the_pendulum(paper):
+    """The Hamiltonian's own scaling: period and all times go with sqrt(l) when both lengths grow."""
+    gravity = np.array([9.8, 4.9])
+    field = dpend.sweep(
+        LAST, paper, {"g": gravity, "theta1": np.array([0.4, 1.0])}, at={"theta2": 0.3}, method="rk8-circle", step=4e-3
+    )
+    assert field.end1.dims == ("g", "theta1")
+    alone = dpend.flow(Pendulum(g=4.9), dpend.released(1.0, 0.3), 1.0, dpend.Scheme("rk8", 4e-3))
+    assert field.attrs["method"] == "rk8-circle"
+    np.testing.assert_allclose(field.end2[1, 1], alone.theta2, atol=1e-10)
+
+
+def test_failure_is_data(paper):
+    """A start beyond what sine can reduce: that cell is NaN and says so, the others are as they were."""
+    theta = np.array([0.5, 1e9, 1.5])
+    field = dpend.sweep(LYAPUNOV, paper, {"theta2": theta}, method="rk4-circle", step=1e-2)
+    assert list(field.status.values) == [Status.CONVERGED, Status.NONFINITE, Status.CONVERGED]
+    clean = dpend.sweep(LYAPUNOV, paper, {"theta2": np.array([0.5, 0.7, 1.5])}, method="rk4-circle", step=1e-2)
+    np.testing.assert_array_equal(field.lyapunov.values[[0, 2]], clean.lyapunov.values[[0, 2]])
+
+
+def test_the_tolerance_is_kept_for_other_pendulums():
+    """99 in 100 releases over the square, after two periods of the slow mode, against a tenth of the step."""
+    for pendulum in (Pendulum(), Pendulum(0.3, 0.2, 0.1, 0.4), Pendulum(1.0, 1.0, 1.0, 0.1, 1.0)):
+        duration = 26.0 / float(dpend.normal_modes(pendulum)[1].frequency)
+        scheme = dpend.scheme_for(pendulum, 1e-6)
+        axes = {"theta1": SIDE, "theta2": SIDE}
+        settings = {"method": scheme.name, "step": scheme.step, "error": "half-step"}
+        field = dpend.sweep(partial(last, duration=duration), pendulum, axes, **settings)
+        worst = np.maximum(field.end1_error, field.end2_error)
+        assert np.quantile(worst, 0.99) < 3e-6
+
+
+def test_a_store_holds_the_map(paper, flips, tmp_path):
+    import xarray
+
+    axes, store = {"theta1": SIDE, "theta2": SIDE}, tmp_path / "map.zarr"
+    field = dpend.sweep(FLIP, paper, axes, store=store)
+    again = dpend.sweep(FLIP, paper, axes, store=store)
+    opened = xarray.open_zarr(store, consolidated=False, chunks=None)
+    for each in (field, again, opened):
+        for key in flips.data_vars:
+            np.testing.assert_array_equal(each[key], flips[key])
+        np.testing.assert_allclose(each.theta1_deg, np.degrees(SIDE))
+    assert opened.flip_time.attrs["units"] == "s"
+    assert opened.attrs["quantity"] == "dpend.chaos.flip"
+    with pytest.raises(ValueError, match="holds another sweep, its g is 9.8, not 9.7"):
+        dpend.sweep(FLIP, Pendulum(g=9.7), axes, store=store)
+    with pytest.raises(ValueError, match=r"its quantity_settings is .*3.0.*, not .*4.0"):
+        dpend.sweep(partial(chaos.flip, duration=4.0), paper, axes, store=store)
+    with pytest.raises(ValueError, match="its axes_sha256 is"):
+        dpend.sweep(FLIP, paper, {"theta1": SIDE, "theta2": SIDE / 2}, store=store)
+    with pytest.raises(ValueError, match="must be a Zarr store of a sweep or a new name"):
+        dpend.sweep(FLIP, paper, axes, store=tmp_path)
+    with pytest.raises(ValueError, match="name must be given to store a lambda or a closure"):
+        dpend.sweep(lambda p, x, s: {"a": x.theta1}, paper, axes, store=tmp_path / "b.zarr")
+
+
+def contents(store):
+    return {path.relative_to(store): path.read_bytes() for path in sorted(store.rglob("*")) if path.is_file()}
+
+
+def test_an_unfinished_store_is_finished_with_the_same_bytes(paper, tmp_path, monkeypatch):
+    """Stopped at every tile in turn, one of them between its values and its status."""
+    monkeypatch.setattr(sweeps, "_TILE", 7)
+    axes = {"theta1": SIDE, "theta2": SIDE}
+    dpend.sweep(FLIP, paper, axes, store=tmp_path / "whole.zarr")
+    write, stopped, tries = sweeps._write, tmp_path / "stopped.zarr", 0
+
+    def breaks(path, array, block, values):
+        nonlocal tries
+        tries += 1
+        if tries % 6 == 0:
+            raise KeyboardInterrupt
+        write(path, array, block, values)
+
+    monkeypatch.setattr(sweeps, "_write", breaks)
+    for _ in range(200):
+        try:
+            dpend.sweep(FLIP, paper, axes, store=stopped)
+            break
+        except KeyboardInterrupt:
+            (stopped / "status" / "left.partial").write_bytes(b"half a chunk")
+    assert tries > 60
+    assert contents(stopped) == contents(tmp_path / "whole.zarr")
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment(tmp_path):
+    """kill -9 once a few chunks are there, several times over, then to the end."""
+    command = [sys.executable, "-m", "dpend.cli", "map", "lyapunov", "--size", "600x520", "--duration", "4", "--json"]
+    subprocess.run([*command, "--out", str(tmp_path / "whole.zarr")], check=True, stdout=subprocess.DEVNULL)
+    store, seen = tmp_path / "killed.zarr", 0
+    for _ in range(3):
+        process = subprocess.Popen([*command, "--out", str(store)], stdout=subprocess.DEVNULL)
+        while process.poll() is None and len(list(store.glob("status/c/*/*"))) <= seen:
+            time.sleep(0.002)
+        seen = len(list(store.glob("status/c/*/*")))
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert 0 < seen < 9
+    subprocess.run([*command, "--out", str(store)], check=True, stdout=subprocess.DEVNULL)
+    assert contents(store) == contents(tmp_path / "whole.zarr")
+
+
+def test_bad_sweeps_are_refused(paper):
+    axes = {"theta1": SIDE}
+    for settings, text in (
+        ({"axes": {}}, "axes must be one or two, got 0"),
+        ({"axes": {"angle": SIDE}}, "must be fields of State or Pendulum, got 'angle'"),
+        ({"axes": {"theta1": [0.0, math.nan]}}, "axis theta1 must be a one-dimensional array of finite numbers"),
+        ({"axes": {"l1": [0.1, -1.0]}}, "axis l1 must be positive, got -1"),
+        ({"at": {"theta1": 1.0}}, "at must name fields of State that are no axis, got 'theta1'"),
+        ({"tolerance": -1.0}, "tolerance must be a finite positive number"),
+        ({"tolerance": 1e-6, "method": "rk4", "step": 1e-3}, "tolerance excludes method and step"),
+        ({"method": "rk4"}, "step must be given with method"),
+        ({"method": "euler", "step": 0.1}, "method must be one of rk4"),
+        ({"quantity": lambda p, x, s: {"theta1": x.p1}}, "must not bear the name of a coordinate, got 'theta1'"),
+        ({"error": "richardson"}, 'error must be None or "half-step"'),
+    ):
+        with pytest.raises(ValueError, match=text):
+            dpend.sweep(**({"quantity": LYAPUNOV, "pendulum": paper, "axes": axes} | settings))
+    with pytest.raises(ValueError, match="g must not be zero for a tolerance"):
+        dpend.sweep(LYAPUNOV, Pendulum(g=0.0), axes)
