@@ -500,7 +500,9 @@ def _stored(task: _Task, path: Path, attributes: dict[str, Any], tell: Callable[
     for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
         leftover.unlink()
     # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
-    arrays = {key: zarr.open_array(path / key, mode="r+", config={"write_empty_chunks": True}) for key in _kinds(task)}
+    arrays = {
+        key: zarr.open_array(path / key, mode="r+").with_config({"write_empty_chunks": True}) for key in _kinds(task)
+    }
     progress = _Progress(task, tell)
     todo = []
     for block in task.grid.tiles():

@@ -49,6 +49,55 @@ def test_both_partners_of_forty_degrees(capsys):
     assert abs(inner["energy_J"] - expected) < 1e-12
 
 
+@pytest.mark.parametrize(("quantity", "value"), [("flip", "flip_time"), ("lyapunov", "lyapunov")])
+def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
+    out, figure = tmp_path / "m.zarr", tmp_path / "m.png"
+    command = ("map", quantity, "--size", "12x10", "--duration", 0.5, "--out", out)
+    status, first = run_json(capsys, *command, "--figure", figure)
+    assert (status, first["cells"], first["done"], first["failed"]) == (0, 120, 120, 0)
+    assert first["steps_per_second"] > 0
+    assert first["scheme"]["method"] == "rk8-circle-rescaled"
+    assert figure.stat().st_size > 10_000
+    import xarray
+
+    field = xarray.open_zarr(out, consolidated=False, chunks=None)
+    assert field[value].dims == ("theta1", "theta2")
+    np.testing.assert_allclose(field.theta1_deg, np.arange(-165, 166, 30))
+    np.testing.assert_array_equal(field[value].values, field[value].values[::-1, ::-1])
+    status, again = run_json(capsys, *command)
+    assert (status, again["done"], again["steps_per_second"]) == (0, 120, 0)
+    status, out_text, err = run(capsys, *command, "--g", 9.7)
+    assert (status, out_text, err.count("\n")) == (2, "", 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (("size", "0"), "size must be N or NxM"),
+        (("size", "12y3"), "size must be N or NxM"),
+        (("theta1", "10:-10"), "theta1 must be a range A:B with A below B"),
+        (("theta2", "10"), "theta2 must be a range A:B in degrees"),
+        (("duration", "-1"), "duration must be a finite positive number"),
+        (("figure", "here.pdf"), "figure must be a .png"),
+        (("method", "rk4"), "step must be given with method"),
+        (("error", "all"), "error must be None or"),
+    ],
+)
+def test_bad_maps_are_refused_in_one_line(capsys, tmp_path, change, text):
+    options = {"size": "8", "duration": "1", "out": tmp_path / "m.zarr"} | dict([change])
+    words = [word for key, value in options.items() for word in (f"--{key}", value)]
+    status, out, err = run(capsys, "map", "flip", *words)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert text in err
+    assert not (tmp_path / "m.zarr").exists()
+
+
+def test_map_names_are_checked(capsys, tmp_path):
+    status, _, err = run(capsys, "map", "entropy", "--size", 4, "--duration", 1, "--out", tmp_path / "m.zarr")
+    assert status == 2
+    assert "map must be one of lyapunov, megno, flip, drift, got 'entropy'" in err
+
+
 def test_the_table_names_both_partners(capsys):
     status, out, err = run(capsys, "orbit", "--theta1", "-40")
     assert (status, err) == (0, "")

@@ -1,5 +1,7 @@
 """What is drawn is what was computed."""
 
+from functools import partial
+
 import matplotlib
 
 matplotlib.use("Agg")
@@ -55,3 +57,18 @@ def test_orbit_sheet_shows_whole_orbits(paper):
     np.testing.assert_allclose([x[0], x[-1]], 40, atol=1e-9)
     np.testing.assert_allclose(x[len(x) // 2], -40, atol=1e-9)
     assert "elliptic" in angles.get_title()
+
+
+def test_a_map_shows_its_cells_and_the_line_no_flip_crosses(paper):
+    side = np.pi * (np.arange(10) + 0.5 - 5) / 5
+    field = dpend.sweep(partial(dpend.chaos.flip, duration=1.0), paper, {"theta1": side, "theta2": side})
+    ax = plots.map_of(field)
+    mesh, line = ax.collections[0], ax.collections[1]
+    shown = np.ma.filled(mesh.get_array(), np.nan).reshape(10, 10)
+    expected = np.where(np.isfinite(field.flip_time.values), field.flip_time.values, np.nan).T
+    np.testing.assert_array_equal(shown, expected)
+    on_line = np.radians(np.concatenate([path.vertices for path in line.get_paths()]))
+    assert np.max(np.abs(2 * np.cos(on_line[:, 0]) + np.cos(on_line[:, 1]) - 1)) < 0.15  # of a coarse grid
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("theta1 (deg)", "theta2 (deg)")
+    with pytest.raises(ValueError, match="name must be one of flip_time, bob, steps, status, got 'flips'"):
+        plots.map_of(field, "flips")

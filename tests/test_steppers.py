@@ -10,9 +10,18 @@ from dpend import Scheme, State
 STATE = State(1.0, -0.7, 0.01, 0.004)
 
 
-@pytest.mark.parametrize(("name", "order", "steps"), [("rk4", 4, (100, 200, 400)), ("rk8", 8, (20, 24, 32))])
+@pytest.mark.parametrize(
+    ("name", "order", "steps"),
+    [
+        ("rk4", 4, (100, 200, 400)),
+        ("rk8", 8, (20, 24, 32)),
+        ("rk4-circle", 4, (100, 200, 400)),
+        ("rk8-circle", 8, (20, 24, 32)),
+        ("rk8-circle-rescaled", 8, (20, 24, 32, 40, 48)),
+    ],
+)
 def test_order(paper, name, order, steps):
-    start = dpend.released(0.6, 0.4)
+    start = dpend.released(2.0, 1.0) if name == "rk8-circle-rescaled" else dpend.released(0.6, 0.4)
     exact = dpend.flow(paper, start, 0.4, Scheme("rk8", 0.4 / 400))
     ends = [dpend.flow(paper, start, 0.4, Scheme(name, 0.4 / n)) for n in steps]
     errors = [max(abs(end.theta1 - exact.theta1), abs(end.theta2 - exact.theta2)) for end in ends]
@@ -67,7 +76,7 @@ def test_tangents_are_derivatives_and_leave_the_motion_alone(paper, name):
 
 
 def test_schemes_refuse_what_they_cannot_be():
-    with pytest.raises(ValueError, match="method must be one of rk4, rk8, got 'euler'"):
+    with pytest.raises(ValueError, match="method must be one of rk4, rk8, .*, got 'euler'"):
         Scheme("euler", 0.1)
     for step in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="step must be a finite positive number"):
@@ -78,3 +87,49 @@ def test_schemes_refuse_what_they_cannot_be():
 
 def test_number_of_steps():
     assert [Scheme("rk8", 0.1).steps(t) for t in (0.0, 0.1, 1.0, 1.01, -0.3)] == [0, 1, 10, 11, 3]
+
+
+def test_the_circle_drifts_like_the_methods_error(paper):
+    """s^2 + c^2 = 1 is no invariant of the circle form: it is off by an error of the method's order."""
+    drifts = []
+    for n in (200, 400):
+        scheme = Scheme("rk4-circle", 1.0 / n)
+        constants = scheme.constants(paper, 1.0 / n)
+        move, point = jax.jit(scheme.move), scheme.enter(paper, dpend.released(2.0, 1.0))
+        for _ in range(n):
+            point = move(constants, point)
+        drifts.append(abs(point.sin2**2 + point.cos2**2 - 1))
+    assert 1e-12 < drifts[1] < 1e-7
+    assert abs(np.log2(drifts[0] / drifts[1]) - 4) < 1.5
+
+
+@pytest.mark.parametrize("name", ["rk8-circle", "rk8-circle-rescaled"])
+@pytest.mark.parametrize("pendulum", [dpend.Pendulum(0.3, 0.1, 0.05, 0.4), dpend.Pendulum(1.0, 2.0, 3.0, 0.1, 0.0)])
+def test_the_forms_move_other_pendulums_alike(name, pendulum):
+    """Momenta, other masses and lengths, no gravity, backwards too: the same motion as in (theta, p)."""
+    start = dpend.momenta(pendulum, 0.4, -2.0, 3.0, -5.0)
+    for duration in (0.5, -0.5):
+        plain = dpend.flow(pendulum, start, duration, Scheme("rk8", 5e-4))
+        other = dpend.flow(pendulum, start, duration, Scheme(name, 5e-4))
+        np.testing.assert_allclose(jax.tree.leaves(other), jax.tree.leaves(plain), rtol=1e-9, atol=1e-9)
+
+
+def test_rescaled_derivatives_are_those_of_the_flow(paper):
+    """Forward mode through rescaled time, in the start, the parameters and the duration."""
+
+    def end(theta1, duration, pendulum, scheme):
+        return dpend.flow(pendulum, dpend.released(theta1, 0.4), duration, scheme).theta2
+
+    ours = jax.jacfwd(end, (0, 1, 2))(2.0, 0.6, paper, Scheme("rk8-circle-rescaled", 5e-3))
+    plain = jax.jacfwd(end, (0, 1, 2))(2.0, 0.6, paper, Scheme("rk8", 2e-3))
+    np.testing.assert_allclose(jax.tree.leaves(ours), jax.tree.leaves(plain), rtol=1e-8, atol=1e-9)
+
+
+def test_scheme_for_a_tolerance(paper):
+    """Finer for less error, in the pendulum's own time: lengths four times as long, steps twice."""
+    steps = [dpend.scheme_for(paper, tolerance).step for tolerance in (1e-3, 1e-6, 1e-9)]
+    assert steps[0] > steps[1] > steps[2]
+    longer = dpend.scheme_for(dpend.Pendulum(0.8, 0.8), 1e-6)
+    assert abs(longer.step / steps[1] - 2) < 1e-12
+    with pytest.raises(ValueError, match="tolerance must be a finite positive number"):
+        dpend.scheme_for(paper, 0.0)
