@@ -55,32 +55,30 @@ def norm(pendulum: Pendulum) -> Norm:
 
 
 # A unit tangent in none of the directions that symmetry or the flow singles out.
-_GENERIC = (0.7, 0.5, 0.1, 0.5)
+GENERIC = (0.7, 0.5, 0.1, 0.5)
 
 
-class _Growth(NamedTuple):
-    """A tangent, how often it has been scaled back, and the steps that have been taken."""
+class _Count(NamedTuple):
+    """How often a tangent has been scaled back, and the steps that have been taken."""
 
-    tangent: State
     turns: Scalar
     steps: Scalar
 
-    def log(self, norm: Norm) -> Scalar:
-        """ln |d| since the start, where |d| was one."""
-        return 0.5 * jnp.log(norm.square(self.tangent)) - math.log(_SCALE_BACK) * self.turns
+
+_NONE = _Count(np.float64(0.0), np.float64(0.0))
 
 
-def _grown(growth: _Growth, time: Scalar, dt: Scalar, state: State, tangent: State) -> tuple[_Growth, State]:
+def _grown(count: _Count, time: Scalar, dt: Scalar, state: State, tangent: State) -> tuple[_Count, State]:
     """The `update` that follows one tangent over any length of time."""
     large = jnp.abs(tangent.theta1) + jnp.abs(tangent.theta2) > 1 / _SCALE_BACK
     factor = jnp.where(large, _SCALE_BACK, 1.0)
     tangent = jax.tree.map(lambda x: x * factor, tangent)
-    return _Growth(tangent, growth.turns + jnp.where(large, 1.0, 0.0), growth.steps + 1.0), tangent
+    return _Count(count.turns + jnp.where(large, 1.0, 0.0), count.steps + 1.0), tangent
 
 
-def _ungrown(norm: Norm) -> _Growth:
-    tangent = norm.vector(*_GENERIC)
-    return _Growth(tangent, jnp.asarray(0.0), jnp.asarray(0.0))
+def _log(norm: Norm, tangent: State, count: _Count) -> Scalar:
+    """ln |d| since the start, where |d| was one."""
+    return 0.5 * jnp.log(norm.square(tangent)) - math.log(_SCALE_BACK) * count.turns
 
 
 @partial(jax.jit, static_argnames=("scheme", "duration"))
@@ -100,9 +98,8 @@ def lyapunov(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     """
 
     size = norm(pendulum)
-    start = _ungrown(size)
-    growth = fold(_grown, start, pendulum, state, duration, scheme, tangents=start.tangent)
-    return {"lyapunov": growth.log(size) / duration, "steps": growth.steps.astype(int)}
+    count, tangent = fold(_grown, _NONE, pendulum, state, duration, scheme, tangents=size.vector(*GENERIC))
+    return {"lyapunov": _log(size, tangent, count) / duration, "steps": count.steps.astype(int)}
 
 
 @partial(jax.jit, static_argnames=("scheme", "duration", "windows"))
@@ -131,13 +128,12 @@ def maximal_lyapunov(
 
     def window(carry: tuple[State, State, Scalar], _: None) -> tuple[tuple[State, State, Scalar], Scalar]:
         state, tangent, steps = carry
-        growth = _Growth(tangent, jnp.asarray(0.0), jnp.asarray(0.0))
-        end, growth = fold(_followed, (state, growth), pendulum, state, duration / windows, scheme, tangents=tangent)
-        log = growth.log(size)
-        length = jnp.sqrt(size.square(growth.tangent))
-        return (end, jax.tree.map(lambda x: x / length, growth.tangent), steps + growth.steps), log
+        both = fold(_followed, (state, _NONE), pendulum, state, duration / windows, scheme, tangents=tangent)
+        (end, count), tangent = both
+        length = jnp.sqrt(size.square(tangent))
+        return (end, jax.tree.map(lambda x: x / length, tangent), steps + count.steps), _log(size, tangent, count)
 
-    start = (jax.tree.map(jnp.asarray, state), size.vector(*_GENERIC), jnp.asarray(0.0))
+    start = (jax.tree.map(jnp.asarray, state), size.vector(*GENERIC), jnp.asarray(0.0))
     (_, _, steps), logs = lax.scan(window, start, None, length=windows)
     rates = logs * (windows / duration)
     half = windows // 2
@@ -148,8 +144,8 @@ def maximal_lyapunov(
 
 def _followed(both, time, dt, state, tangent):  # type: ignore[no-untyped-def]
     """The `update` that follows one tangent and keeps the state, so that the motion can go on from there."""
-    growth, tangent = _grown(both[1], time, dt, state, tangent)
-    return (state, growth), tangent
+    count, tangent = _grown(both[1], time, dt, state, tangent)
+    return (state, count), tangent
 
 
 @partial(jax.jit, static_argnames=("scheme", "duration"))
@@ -190,7 +186,7 @@ def spectrum(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
 
     basis = np.eye(4)
     start = State(basis[0], basis[1], basis[2] / size.per_unit1, basis[3] / size.per_unit2)
-    logs, steps = fold(update, (jnp.zeros(4), jnp.asarray(0.0)), pendulum, state, duration, scheme, tangents=start)
+    (logs, steps), _ = fold(update, (jnp.zeros(4), jnp.asarray(0.0)), pendulum, state, duration, scheme, tangents=start)
     return {f"exponent{i + 1}": logs[i] / duration for i in range(4)} | {"steps": steps.astype(int)}
 
 
@@ -222,10 +218,10 @@ def megno(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) 
         tangent = jax.tree.map(lambda x: x * jnp.where(large, _SCALE_BACK, 1.0), tangent)
         return (weighted, mean, square * jnp.where(large, _SCALE_BACK**2, 1.0), steps + 1.0), tangent
 
-    start = size.vector(*_GENERIC)
+    start = size.vector(*GENERIC)
     zero = jnp.asarray(0.0)
     init = (zero, zero, size.square(start), zero)
-    _, mean, _, steps = fold(update, init, pendulum, state, duration, scheme, tangents=start)
+    (_, mean, _, steps), _ = fold(update, init, pendulum, state, duration, scheme, tangents=start)
     return {"megno": mean / duration, "steps": steps.astype(int)}
 
 

@@ -267,7 +267,7 @@ def fold(
     scheme: Scheme,
     *,
     tangents: State | None = None,
-) -> Carry:
+) -> Any:
     """Something accumulated along the motion: `init` after `update` has seen every step.
 
     Arguments:
@@ -278,12 +278,14 @@ def fold(
         pendulum, state, duration, scheme: as for `flow`.
         tangents: vectors (d theta1, d theta2, d p1, d p2) at t = 0 to carry along by the derivative of the flow: one,
             or several along a leading axis.
+    Returns:
+        What `update` made of `init`; with `tangents`, that and the tangents at the end.
     Raises:
         ValueError: duration not finite, or shorter than one even step.
         RuntimeError: float64 is switched off in JAX.
     """
-    _, _, carry = _accumulate(update, init, pendulum, state, tangents, duration, scheme)
-    return carry
+    _, tangents, carry = _accumulate(update, init, pendulum, state, tangents, duration, scheme)
+    return carry if tangents is None else (carry, tangents)
 
 
 def _accumulate(update, init, pendulum, state, tangents, duration, scheme):  # type: ignore[no-untyped-def]

@@ -19,7 +19,7 @@ def both(pendulum, state):
     return state.theta1, state.theta2
 
 
-@pytest.mark.parametrize("name", ["rk8", "rk8-circle-rescaled"])
+@pytest.mark.parametrize("name", [pytest.param("rk8", marks=pytest.mark.slow), "rk8-circle-rescaled"])
 def test_a_simple_pendulum_passes_the_bottom_at_a_quarter_of_its_period(name):
     """m2 -> 0: 4 K(sin^2(a/2)) sqrt(l/g) is the period."""
     pendulum = Pendulum(1.0, 0.7, 1.0, 1e-9, 1.0)
@@ -29,6 +29,7 @@ def test_a_simple_pendulum_passes_the_bottom_at_a_quarter_of_its_period(name):
     assert crossing.which == 0
 
 
+@pytest.mark.slow
 def test_the_crossing_is_exact_to_the_method(paper):
     """The error in time falls with the method's order; an interpolant would end it at its own."""
     start = dpend.released(1.2, 0.4)
@@ -38,6 +39,7 @@ def test_the_crossing_is_exact_to_the_method(paper):
     assert abs(np.polyfit(np.log(steps), np.log(errors), 1)[0] - 4) < 0.5
 
 
+@pytest.mark.slow
 def test_the_first_of_two_and_its_direction(paper):
     start, scheme = dpend.released(1.2, -0.4), Scheme("rk8", 4e-3)
     earliest = dpend.first_crossing(both, paper, start, 2.0, scheme)

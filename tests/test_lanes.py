@@ -80,7 +80,7 @@ def test_results_must_be_scalars(paper):
         lanes.over_lanes(lambda p, x: {"both": jax.numpy.stack([x.theta1, x.p1])}, paper, releases())
 
 
-@pytest.mark.parametrize("devices", [1, 3])
+@pytest.mark.parametrize("devices", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_number_of_devices_does_not_change_a_bit(paper, devices, tmp_path):
     code = f"""
 import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})

@@ -17,7 +17,7 @@ STATE = State(1.0, -0.7, 0.01, 0.004)
         ("rk8", 8, (20, 24, 32)),
         ("rk4-circle", 4, (100, 200, 400)),
         ("rk8-circle", 8, (20, 24, 32)),
-        ("rk8-circle-rescaled", 8, (20, 24, 32, 40, 48)),
+        pytest.param("rk8-circle-rescaled", 8, (20, 24, 32, 40, 48), marks=pytest.mark.slow),
     ],
 )
 def test_order(paper, name, order, steps):
@@ -103,7 +103,7 @@ def test_the_circle_drifts_like_the_methods_error(paper):
     assert abs(np.log2(drifts[0] / drifts[1]) - 4) < 1.5
 
 
-@pytest.mark.parametrize("name", ["rk8-circle", "rk8-circle-rescaled"])
+@pytest.mark.parametrize("name", [pytest.param("rk8-circle", marks=pytest.mark.slow), "rk8-circle-rescaled"])
 @pytest.mark.parametrize("pendulum", [dpend.Pendulum(0.3, 0.1, 0.05, 0.4), dpend.Pendulum(1.0, 2.0, 3.0, 0.1, 0.0)])
 def test_the_forms_move_other_pendulums_alike(name, pendulum):
     """Momenta, other masses and lengths, no gravity, backwards too: the same motion as in (theta, p)."""
@@ -114,6 +114,7 @@ def test_the_forms_move_other_pendulums_alike(name, pendulum):
         np.testing.assert_allclose(jax.tree.leaves(other), jax.tree.leaves(plain), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_rescaled_derivatives_are_those_of_the_flow(paper):
     """Forward mode through rescaled time, in the start, the parameters and the duration."""
 

@@ -108,6 +108,7 @@ def test_failure_is_data(paper):
     np.testing.assert_array_equal(field.lyapunov.values[[0, 2]], clean.lyapunov.values[[0, 2]])
 
 
+@pytest.mark.slow
 def test_the_tolerance_is_kept_for_other_pendulums():
     """99 in 100 releases over the square, after two periods of the slow mode, against a tenth of the step."""
     for pendulum in (Pendulum(), Pendulum(0.3, 0.2, 0.1, 0.4), Pendulum(1.0, 1.0, 1.0, 0.1, 1.0)):
