@@ -136,14 +136,14 @@ def map_of(dataset: Any, name: str | None = None, ax: "Axes | None" = None) -> "
 
     Arguments:
         dataset: what `sweep` returned.
-        name: which value; the first one by default.
+        name: which value; by default the first that this page knows, or the first.
     Raises:
         ValueError: the dataset has not two dimensions, or no such value.
     """
     import matplotlib.colors
     from matplotlib.ticker import MultipleLocator
 
-    name = name or next(iter(dataset.data_vars))
+    name = name or next((key for key in dataset.data_vars if key in _LABELS), next(iter(dataset.data_vars)))
     if name not in dataset.data_vars:
         raise ValueError(f"name must be one of {', '.join(dataset.data_vars)}, got {name!r}")
     field = dataset[name]

@@ -70,5 +70,5 @@ def test_a_map_shows_its_cells_and_the_line_no_flip_crosses(paper):
     on_line = np.radians(np.concatenate([path.vertices for path in line.get_paths()]))
     assert np.max(np.abs(2 * np.cos(on_line[:, 0]) + np.cos(on_line[:, 1]) - 1)) < 0.15  # of a coarse grid
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("theta1 (deg)", "theta2 (deg)")
-    with pytest.raises(ValueError, match="name must be one of flip_time, bob, steps, status, got 'flips'"):
+    with pytest.raises(ValueError, match="name must be one of bob, flip_time, steps, status, got 'flips'"):
         plots.map_of(field, "flips")
