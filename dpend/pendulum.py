@@ -154,18 +154,6 @@ def released(theta1: Scalar, theta2: Scalar) -> State:
     return State(theta1, theta2, at_rest, at_rest)
 
 
-@jax.custom_jvp
-def reciprocal(x: Scalar) -> Scalar:
-    """1/x, whose derivative -(1/x)^2 dx makes no second division: one costs as much as a dozen multiplications."""
-    return 1.0 / x
-
-
-@reciprocal.defjvp
-def _reciprocal_jvp(primals, tangents):  # type: ignore[no-untyped-def]
-    inverse = reciprocal(*primals)
-    return inverse, -(inverse * inverse) * tangents[0]
-
-
 def _relative_angle(state: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """sin theta1, sin theta2, and sine and cosine of delta = theta1 - theta2, from two calls."""
     sin1, cos1 = sincos(state.theta1)
@@ -179,7 +167,7 @@ def _rates(pendulum: Pendulum, state: State, sin_delta: Scalar, cos_delta: Scala
     inertia2 = pendulum.m2 * pendulum.l2 * pendulum.l2
     coupling = pendulum.m2 * pendulum.l1 * pendulum.l2 * cos_delta
     scale = inertia2 * pendulum.l1 * pendulum.l1
-    inverse = reciprocal(scale * pendulum.m1 + scale * pendulum.m2 * (sin_delta * sin_delta))
+    inverse = 1.0 / (scale * pendulum.m1 + scale * pendulum.m2 * (sin_delta * sin_delta))
     omega1 = (inertia2 * state.p1 - coupling * state.p2) * inverse
     omega2 = (inertia1 * state.p2 - coupling * state.p1) * inverse
     return omega1, omega2

@@ -127,6 +127,10 @@ _LABELS = {
 }
 
 
+# Cells along a picture's side; of larger maps every n-th cell is drawn, more than a screen shows anyway.
+_MOST_CELLS = 1500
+
+
 def map_of(dataset: Any, name: str | None = None, ax: "Axes | None" = None) -> "Axes":
     """One value of a two-dimensional sweep in colours, its first axis to the right, its second upwards.
 
@@ -150,6 +154,9 @@ def map_of(dataset: Any, name: str | None = None, ax: "Axes | None" = None) -> "
     if field.ndim != 2:
         raise ValueError(f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve")
     ax = _axes(ax)
+    every = -(-max(field.shape) // _MOST_CELLS)
+    dataset = dataset.isel({dim: slice(None, None, every) for dim in field.dims})
+    field = dataset[name]
     across, up = field.dims
     label, decades = _LABELS.get(name.removesuffix("_error"), (name, False))
     if name.endswith("_error"):

@@ -30,7 +30,6 @@ from dpend.pendulum import (
     fast_frequency,
     hamiltonian,
     number,
-    reciprocal,
     vector_field,
 )
 from dpend.trig import sincos
@@ -244,7 +243,7 @@ def _circle_slopes(constants: _Constants, even: bool, x: _Circle, nudge: _Nudge 
         sin_delta, cos_delta = sin_delta + cos_delta * between, cos_delta - sin_delta * between
         sin1, sin2 = sin1 + x.cos1 * nudge.angle1, sin2 + x.cos2 * nudge.angle2
         rate1, rate2 = nudge.rate1, nudge.rate2
-    inverse = reciprocal(1.0 + sin_delta * sin_delta)
+    inverse = 1.0 / (1.0 + sin_delta * sin_delta)
     turn1 = rate1 - cos_delta * rate2
     turn2 = constants.ratio * (constants.mass_ratio * rate2 - cos_delta * rate1)
     dt, weight1, weight2 = constants.step, constants.weight1, constants.weight2
