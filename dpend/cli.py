@@ -124,7 +124,7 @@ def simulate(
     duration: Annotated[float, _numeric(help="How long [s]; negative runs backwards.")],
     p1: Annotated[float, _numeric("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")] = 0.0,
     p2: Annotated[float, _numeric("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")] = 0.0,
-    method: Annotated[str, typer.Option(help="rk4 or rk8.")] = "rk8",
+    method: Annotated[str, typer.Option(help="rk4, rk8, rk4-circle or rk8-circle.")] = "rk8",
     step: Annotated[float | None, _numeric(help="Largest step [s].")] = None,
     tolerance: Annotated[
         float | None, _numeric(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
@@ -241,11 +241,18 @@ _MAPS = {
 }
 
 
+# Along a map's side: sixteen times what a large map has; beyond it lies a slip of the finger.
+_MOST_CELLS = 65536
+
+
 def _size(text: str) -> tuple[int, int]:
     sides = text.lower().split("x")
     if len(sides) > 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
         raise ValueError(f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like 512x256")
-    return int(sides[0]), int(sides[-1])
+    cells = int(sides[0]), int(sides[-1])
+    if max(cells) > _MOST_CELLS:
+        raise ValueError(f"size must be at most {_MOST_CELLS} along a side, got {text!r}: map a smaller range")
+    return cells
 
 
 def _cells(name: str, text: str, count: int) -> np.ndarray:

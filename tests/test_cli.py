@@ -77,6 +77,7 @@ def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
     [
         (("size", "0"), "size must be N or NxM"),
         (("size", "12y3"), "size must be N or NxM"),
+        (("size", "999999999999"), "size must be at most 65536 along a side"),
         (("theta1", "10:-10"), "theta1 must be a range A:B with A below B"),
         (("theta2", "10"), "theta2 must be a range A:B in degrees"),
         (("duration", "-1"), "duration must be a finite positive number"),
