@@ -366,32 +366,24 @@ def _tile_values(  # type: ignore[no-untyped-def]
     """The values and status of a tile's cells; done(block) gives those of any block so far."""
     grid = task.grid
     shape = tuple(part.stop - part.start for part in block)
-    compute, own_image = np.ones(shape, bool), np.zeros(shape, bool)
-    known = None if parities is None else done(grid.reflected(block))
-    if parities is not None:
-        places = np.meshgrid(*(np.arange(part.start, part.stop) for part in block), indexing="ij")
-        images = [
-            size - 1 - place if key in _STATE else place
-            for key, size, place in zip(grid.axes, grid.shape, places, strict=True)
-        ]
-        inside = np.all([(part.start <= im) & (im < part.stop) for part, im in zip(block, images, strict=True)], axis=0)
-        later = np.ravel_multi_index(places, grid.shape) > np.ravel_multi_index(images, grid.shape)
-        own_image = inside & later  # of such a pair one is computed
-        compute &= ~own_image
-        if known is not None:
-            known = {key: grid.turned(array) for key, array in known.items()}
-            compute &= known["status"] == Status.NOT_COMPUTED
-            own_image &= known["status"] == Status.NOT_COMPUTED
-    values = _lane_values(task, block, compute, progress)
     if parities is None:
-        return values
+        return _lane_values(task, block, np.ones(shape, bool), progress)
+    known = {key: grid.turned(array) for key, array in done(grid.reflected(block)).items()}
+    fresh = known["status"] == Status.NOT_COMPUTED
+    places = np.meshgrid(*(np.arange(part.start, part.stop) for part in block), indexing="ij")
+    images = [
+        size - 1 - place if key in _STATE else place
+        for key, size, place in zip(grid.axes, grid.shape, places, strict=True)
+    ]
+    inside = np.all([(part.start <= im) & (im < part.stop) for part, im in zip(block, images, strict=True)], axis=0)
+    later = np.ravel_multi_index(places, grid.shape) > np.ravel_multi_index(images, grid.shape)
+    own_image = fresh & inside & later  # of a pair of images within the tile one is computed
+    values = _lane_values(task, block, fresh & ~own_image, progress)
+    source = tuple(im[own_image] - part.start for im, part in zip(images, block, strict=True))
     for key, array in values.items():
-        parity = parities.get(key, 1)  # the status is even
-        if known is not None:
-            copied = ~compute & ~own_image
-            array[copied] = parity * known[key][copied] if key in parities else known[key][copied]
-        source = tuple(im[own_image] - part.start for im, part in zip(images, block, strict=True))
-        array[own_image] = parity * array[source] if key in parities else array[source]
+        parity = np.asarray(parities.get(key, 1), array.dtype)  # the status is even
+        array[~fresh] = parity * known[key][~fresh]
+        array[own_image] = parity * array[source]
     return values
 
 
