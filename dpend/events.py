@@ -17,7 +17,7 @@ from dpend.pendulum import Pendulum, Scalar, State, vector_field
 from dpend.steppers import Scheme
 from dpend.trajectory import fold
 
-# Newton's method from the secant of a step needs four or five; each bisection of the bracket takes one more.
+# Newton's method from the middle of a step needs five or six; each bisection of the bracket takes one more.
 _MOST_ITERATIONS = 40
 # Of the step: an update this small leaves, squared, nothing for the next.
 _TIME_TOLERANCE = 1e-8
@@ -80,6 +80,22 @@ def first_crossing(
     return _first_crossing(functions, pendulum, state, float(duration), scheme, direction)
 
 
+class _Landing(NamedTuple):
+    """Where the crossing lies inside its step: a bracket and Newton's latest time [s, from the step's start], the
+    functions that cross before the bracket's end, which of them first, and the state at the time last tried.
+    """
+
+    low: Scalar
+    high: Scalar
+    tau: Scalar
+    among: jax.Array
+    which: Scalar
+    state: State
+    close: Scalar
+    done: Scalar
+    count: Scalar
+
+
 @partial(jax.jit, static_argnames=("functions", "duration", "scheme", "direction"))
 def _first_crossing(functions, pendulum, state, duration, scheme, direction):  # type: ignore[no-untyped-def]
     def look(search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
@@ -106,48 +122,45 @@ def _crossed(before: jax.Array, after: jax.Array, direction: int) -> jax.Array:
 
 
 def _landed(functions, pendulum, search, scheme, direction):  # type: ignore[no-untyped-def]
-    """The crossing inside the step that starts at search.before."""
-
-    def at(tau: Scalar) -> State:
-        return scheme.plain.advance(pendulum, search.before, tau)
+    """The crossing inside the step that starts at search.before: a bracket of the earliest change of sign of any
+    function, and inside it Newton's method on the function that changes first.
+    """
+    unit, point = scheme.constants(pendulum), scheme.enter(pendulum, search.before)
+    start, sense = _values(functions, pendulum, search.before), jnp.sign(search.dt)
 
     def values(state: State) -> tuple[jax.Array, jax.Array]:
         """The functions and their rates of change along the motion."""
         field = vector_field(pendulum, state)
         return jax.jvp(lambda x: _values(functions, pendulum, x), (state,), (field,))
 
-    start, end = (_values(functions, pendulum, at(tau)) for tau in (jnp.zeros_like(search.dt), search.dt))
-    crossed = search.found & _crossed(start, end, direction)
-    # The step in time itself ends a method error away from the step taken: what crosses by less crosses at the end.
-    crossed = jnp.where(jnp.any(crossed), crossed, search.found)
-    guess = search.dt * jnp.abs(start) / (jnp.abs(start) + jnp.abs(end))
+    def newton(carry: _Landing) -> _Landing:
+        tau = carry.tau
+        state = scheme.leave(unit, scheme.move(scheme.lasting(unit, tau), point))
+        here, slopes = values(state)
+        crossed = _crossed(start, here, direction)
+        late = jnp.any(crossed)
+        low, high = jnp.where(late, carry.low, tau), jnp.where(late, tau, carry.high)
+        among = jnp.where(late, crossed, carry.among)
+        there = jnp.where(here == 0, tau, tau - here / slopes)
+        aims = jnp.where(among, sense * there, jnp.inf)
+        aims = jnp.where(aims >= sense * low, aims, jnp.inf)
+        which = jnp.argmin(aims)
+        aim = jnp.where(aims[which] < jnp.inf, sense * jnp.minimum(aims[which], sense * high), 0.5 * (low + high))
+        # One evaluation more than the updates need: the state belongs to the time.
+        aim = jnp.where(carry.close, tau, aim)
+        close = jnp.abs(aim - tau) <= _TIME_TOLERANCE * jnp.abs(search.dt)
+        return _Landing(low, high, aim, among, which, state, close, carry.close, carry.count + 1)
 
-    def one(index: Scalar, sign: Scalar, tau: Scalar, crosses: Scalar) -> Scalar:
-        def newton(carry: Any) -> Any:
-            low, high, tau, _, count = carry
-            value, slope = (both[index] for both in values(at(tau)))
-            early = value * sign > 0
-            low, high = jnp.where(early, tau, low), jnp.where(early, high, tau)
-            step = -value / slope
-            inside = (jnp.abs(tau + step - low) <= jnp.abs(high - low)) & (
-                jnp.abs(high - tau - step) <= jnp.abs(high - low)
-            )
-            new = jnp.where(value == 0, tau, jnp.where(inside, tau + step, 0.5 * (low + high)))
-            return low, high, new, jnp.abs(new - tau) > _TIME_TOLERANCE * jnp.abs(search.dt), count + 1
+    def goes_on(carry: _Landing) -> Scalar:
+        return search.found & ~carry.done & (carry.count < _MOST_ITERATIONS)
 
-        def goes_on(carry: Any) -> Scalar:
-            return carry[3] & (carry[4] < _MOST_ITERATIONS)
-
-        first = (jnp.asarray(0.0), search.dt, tau, crosses, jnp.asarray(0))
-        return lax.while_loop(goes_on, newton, first)[2]
-
-    taus = jax.vmap(one)(jnp.arange(end.size), jnp.sign(start), guess, crossed)
-    taus = jnp.where(crossed, taus, jnp.inf)
-    which = jnp.argmin(jnp.abs(taus))
-    tau = jnp.where(search.found, taus[which], 0.0)
+    tau = jnp.where(search.found, 0.5 * search.dt, 0.0)
+    among, no = jnp.ones_like(start, bool), jnp.zeros_like(search.found)
+    first = _Landing(0.0 * tau, search.dt, tau, among, jnp.asarray(0), search.before, no, no, jnp.asarray(0))
+    landing = lax.while_loop(goes_on, newton, first)
     return Crossing(
-        jnp.where(search.found, search.time - search.dt + tau, jnp.inf),
-        at(tau),
-        jnp.where(search.found, which, -1),
+        jnp.where(search.found, search.time - search.dt + landing.tau, jnp.inf),
+        landing.state,
+        jnp.where(search.found, landing.which, -1),
         search.steps,
     )

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jaxtyping import ArrayLike
 
 from dpend._runtime import require_float64
@@ -179,54 +180,67 @@ def _folded(update, init, pendulum, state, tangents, duration, steps, scheme):  
     if scheme.even:
         dt = step_size(duration, steps if not isinstance(steps, int) else max(steps, 1))
         constants = scheme.constants(pendulum, dt)
-        step = _stepper(update, scheme, constants)
-        along = march(lambda along, time, dt: step(along, lambda _: (time, dt)), along, dt, steps)
+        along = march(partial(_stepped, update, scheme, constants), along, dt, steps)
         return scheme.leave(constants, along.point), along.tangents, along.carry
     return _unevenly(update, pendulum, state, along, duration, scheme)
 
 
-def _stepper(update, scheme, constants):  # type: ignore[no-untyped-def]
-    """One step shown to `update`; clock(point) tells the time reached and how long the step was."""
+def _stepped(update, scheme, constants, along, time, dt):  # type: ignore[no-untyped-def]
+    """One step shown to `update`."""
+    if along.tangents is None:
+        point = scheme.move(constants, along.point)
+        return _Along(point, None, update(along.carry, time, dt, scheme.leave(constants, point)))
+    point, tangents = scheme.move_tangents(constants, along.point, along.tangents)
+    carry, tangents = update(along.carry, time, dt, scheme.leave(constants, point), tangents)
+    return _Along(point, tangents, carry)
 
-    def step(along, clock):  # type: ignore[no-untyped-def]
-        if along.tangents is None:
-            point, tangents = scheme.move(constants, along.point), None
-            carry = update(along.carry, *clock(point), scheme.leave(constants, point))
-        else:
-            point, tangents = scheme.move_tangents(constants, along.point, along.tangents)
-            carry, tangents = update(along.carry, *clock(point), scheme.leave(constants, point), tangents)
-        return _Along(point, tangents, carry)
 
-    return step
+@custom_vmap
+def _any_lane(going: Scalar) -> Scalar:
+    """Whether any lane goes on: a loop's condition that under `vmap` is one for all lanes, so that JAX does not select
+    every array of every step by it.
+    """
+    return going
+
+
+@_any_lane.def_vmap
+def _any_of_many(size: int, batched: list[bool], going: Scalar) -> tuple[Scalar, bool]:
+    return jnp.any(going), False
 
 
 def _unevenly(update, pendulum, state, along, duration, scheme):  # type: ignore[no-untyped-def]
-    """Steps in the scheme's own time up to the last one before `duration`, and one in time itself onto it."""
+    """Steps in the scheme's own time, the last one cut to end at `duration`.
+
+    A lane that has arrived takes steps of length zero, which leave its point as it is to the bit, until all have.
+    """
     sense = jnp.where(duration < 0, -1.0, 1.0)
-    ds = sense * scheme.step * scheme.pace(pendulum, state)
-    step = _stepper(update, scheme, scheme.constants(pendulum, ds))
+    longest = scheme.step * scheme.pace(pendulum, state)
+    unit = scheme.constants(pendulum)
 
-    def advance(both: tuple[_Along, Scalar]) -> tuple[_Along, Scalar]:
-        along, _ = both
-        before = along.point.time
-        ahead = step(along, lambda point: (point.time, point.time - before))
-        past = sense * (ahead.point.time - duration) >= 0  # then this step is not taken
-        lost = ~past & ~(jnp.abs(ahead.point.time - before) >= _SHORTEST_STEP * jnp.abs(ds))  # also where it is NaN
-        ahead = jax.tree.map(partial(jnp.where, past), along, ahead)
-        time = jnp.where(lost, jnp.nan, ahead.point.time)
-        return ahead._replace(point=ahead.point._replace(time=time)), ~(past | lost)
+    def goes(time: Scalar) -> Scalar:
+        return sense * (duration - time) > 0
 
-    along, _ = lax.while_loop(lambda both: both[1], advance, (along, duration != 0))
-    rest = duration - along.point.time
-    constants = scheme.evenly.constants(pendulum, rest)
-    land = _stepper(update, scheme.evenly, constants)
+    def advance(carried):  # type: ignore[no-untyped-def]
+        along, time, before = carried
+        spin = scheme.spin(unit, along.point)
+        # Between this step's start and its end u is not yet known: the last step's ratio tells where it goes.
+        ahead = jnp.maximum(spin * (spin / before), 1.0)
+        root = jnp.sqrt(ahead)
+        dt = longest / (root * jnp.sqrt(jnp.sqrt(root)))
+        lost = ~(dt >= _SHORTEST_STEP * longest)  # also where it is not a number
+        rest, live = duration - time, goes(time)
+        last = dt >= sense * rest
+        dt = jnp.where(lost, jnp.nan, jnp.where(last, rest, sense * dt))
+        dt = jnp.where(live, dt, 0.0)
+        time = jnp.where(last & ~lost, duration, time + dt)
+        ahead = _stepped(update, scheme, scheme.lasting(unit, dt), along, time, dt)
+        kept = jax.tree.map(partial(jnp.where, live), ahead[1:], along[1:])
+        return _Along(ahead.point, *kept), time, spin
 
-    def once(both: tuple[_Along, Scalar]) -> tuple[_Along, Scalar]:
-        return land(both[0], lambda _: (duration, rest)), jnp.zeros_like(both[1])
-
-    # A loop of at most one turn: as straight code XLA fuses the twelve stages into each of their results, each anew.
-    along, _ = lax.while_loop(lambda both: both[1], once, (along._replace(point=along.point.circle), ~(rest == 0)))
-    return scheme.evenly.leave(constants, along.point), along.tangents, along.carry
+    time = jnp.zeros_like(state.theta1)
+    carried = along, time, scheme.spin(unit, along.point)
+    along, _, _ = lax.while_loop(lambda carried: _any_lane(goes(carried[1])), advance, carried)
+    return scheme.leave(unit, along.point), along.tangents, along.carry
 
 
 _fold = jax.jit(_folded, static_argnames=("update", "steps", "scheme"))
@@ -242,7 +256,7 @@ def flow(pendulum: Pendulum, state: State, duration: Scalar, scheme: Scheme) -> 
     """The state after `duration`, no trajectory stored.
 
     Even methods take n = ceil(duration/step - 1e-9) steps of duration/n each; the rescaled one takes steps in its own
-    time and one in time itself onto the end.
+    time, the last one cut to end there.
 
     Arguments:
         pendulum, state: leaves are scalars; `jax.vmap` maps over many.
