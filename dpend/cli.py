@@ -10,7 +10,6 @@ import json
 import math
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -24,6 +23,7 @@ import typer
 import dpend
 from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
+from dpend.plots import check_place, replacing
 from dpend.steppers import METHODS
 from dpend.trajectory import Status, Trajectory
 
@@ -184,10 +184,10 @@ def map_command(
         key: _cells(key, text, count)
         for key, text, count in zip(("theta1", "theta2"), (theta1, theta2), _size(size), strict=True)
     }
-    if figure is not None and (figure.suffix != ".png" or not figure.parent.is_dir()):
-        raise ValueError(f"figure must be a .png in a directory that exists, got {figure}: give another name")
+    if figure is not None:
+        check_place("figure", figure, (".png",))
     started, counts = time.perf_counter(), [0, 0, 0]
-    with _bar(sys.stderr.isatty()) as show:
+    with _bar(sys.stderr.isatty(), "cells") as show:
 
         def tell(*now: int) -> None:
             counts[:] = now
@@ -224,6 +224,53 @@ def map_command(
         print(f"{record['steps_per_second']:.3g} steps/s of {field.attrs['method']}, {field.attrs['step']:.4g} s")
         print(f"written to {out}" + (f", drawn in {figure}" if figure else ""))
     return 0
+
+
+@app.command()
+def animate(
+    theta1: Annotated[list[float], _numeric("--theta1", help="Release angle of the upper rod [deg]; once a release.")],
+    theta2: Annotated[list[float], _numeric("--theta2", help="Release angle of the lower rod [deg]; once a release.")],
+    duration: Annotated[float, _numeric(help="How long the motion lasts [s].")],
+    out: Annotated[Path, typer.Option(help="F.gif, F.mp4, or F.png with all pictures in one.")],
+    speed: Annotated[float, _numeric(help="Seconds of the motion in a second of the film.")] = 1.0,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """A film of a motion in real time; of several, in one picture, where --theta1 and --theta2 are given again."""
+    from dpend import animate as animation
+
+    if len(theta1) != len(theta2):
+        raise ValueError(
+            f"theta1 and theta2 must be given equally often, got {len(theta1)} and {len(theta2)}: a release is both"
+        )
+    animation.check_out(out)
+    pendulum = Pendulum(l1, l2, m1, m2, g)
+    releases = [
+        dpend.released(_radians("theta1", one), _radians("theta2", two))
+        for one, two in zip(theta1, theta2, strict=True)
+    ]
+    motions = animation.motions_for(pendulum, releases, duration, speed=speed)
+    with _bar(sys.stderr.isatty(), "frames") as show:
+        frames = animation.film(pendulum, motions, out, progress=show)
+    records = [_motion_record(motion) for motion in motions]
+    record = {
+        "frames": frames,
+        "frames_per_second": animation.FRAMES_PER_SECOND if out.suffix != ".png" else None,
+        "out": str(out),
+        "motions": records,
+    }
+    if as_json:
+        _print_json(record)
+    else:
+        print(f"{frames} frames of {len(motions)} motion{'s' * (len(motions) > 1)} written to {out}")
+        for one, two, motion in zip(theta1, theta2, records, strict=True):
+            if motion["status"] != "converged":
+                print(f"({one:g}, {two:g}) deg: {motion['status']}: {motion['message']}")
+    return 0 if all(int(motion.status) == Status.CONVERGED for motion in motions) else 1
 
 
 # --- what is read ----------------------------------------------------------------------------------------------------
@@ -268,25 +315,25 @@ def _cells(name: str, text: str, count: int) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _bar(shown: bool) -> Iterator[Callable[[int, int, int], None]]:
-    """A progress bar on standard error, with the rate in steps per second and the time left."""
+def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
+    """A progress bar on standard error with the time left, and the rate where steps are told too."""
     if not shown:
-        yield lambda done, cells, steps: None
+        yield lambda done, total, steps=0: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
-        TextColumn("{task.completed:.0f}/{task.total:.0f} cells"),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} " + unit),
         BarColumn(),
         TextColumn("{task.fields[rate]}"),
     )
     with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
         task, started = progress.add_task("", total=1, rate=""), time.perf_counter()
 
-        def show(done: int, cells: int, steps: int) -> None:
+        def show(done: int, total: int, steps: int = 0) -> None:
             millions = steps / max(time.perf_counter() - started, 1e-9) / 1e6
-            progress.update(task, completed=done, total=cells, rate=f"{millions:.1f} M steps/s")
+            progress.update(task, completed=done, total=total, rate=f"{millions:.1f} M steps/s" if steps else "")
 
         yield show
 
@@ -409,22 +456,11 @@ def _print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) 
 def _writer(path: Path) -> Callable[[Trajectory], None]:
     """How to write a motion to `path`; refuses before anything is computed what could not be written after."""
     formats = {".csv": _write_csv, ".nc": _write_netcdf}
-    if path.suffix not in formats:
-        raise ValueError(f"out must end in {' or '.join(formats)}, got {path}: give another name")
-    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ValueError(f"out must be a file in a directory that can be written to, got {path}: give another place")
+    check_place("out", path, tuple(formats))
 
     def write(motion: Trajectory) -> None:
-        # A temporary name first: a file that is there, old or new, is always whole.
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
-        os.close(handle)
-        try:
-            formats[path.suffix](motion, Path(name))
-            os.chmod(name, 0o644)
-            os.replace(name, path)
-        except BaseException:
-            os.unlink(name)
-            raise
+        with replacing(path) as draft:
+            formats[path.suffix](motion, draft)
 
     return write
 
@@ -455,10 +491,8 @@ def _draw(field: Any, path: Path) -> None:
     fig, axes = plt.subplots(1, len(names), figsize=(5.6 * len(names), 4.6), layout="constrained", squeeze=False)
     for name, ax in zip(names, axes[0], strict=True):
         plots.map_of(field, name, ax)
-    with tempfile.NamedTemporaryFile(prefix=f".{path.name}.", suffix=".png", dir=path.parent, delete=False) as draft:
+    with replacing(path) as draft:
         fig.savefig(draft, dpi=200)
-    os.chmod(draft.name, 0o644)
-    os.replace(draft.name, path)
     plt.close(fig)
 
 

@@ -81,7 +81,7 @@ def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
         (("theta1", "10:-10"), "theta1 must be a range A:B with A below B"),
         (("theta2", "10"), "theta2 must be a range A:B in degrees"),
         (("duration", "-1"), "duration must be a finite positive number"),
-        (("figure", "here.pdf"), "figure must be a .png"),
+        (("figure", "here.pdf"), "figure must end in .png"),
         (("method", "rk4"), "step must be given with method"),
         (("error", "all"), "error must be None or"),
     ],

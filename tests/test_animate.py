@@ -1,0 +1,118 @@
+"""Films: the frames show the motion at their times, and a file is whole or not there."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import dpend
+from dpend import animate, cli
+
+
+@pytest.fixture(scope="module")
+def pair():
+    pendulum = dpend.Pendulum()
+    return pendulum, animate.motions_for(pendulum, [dpend.released(2.0, 1.0), dpend.released(2.9, -2.0)], 0.4)
+
+
+def test_a_film_lasts_as_long_as_the_motion(pair, tmp_path):
+    told = []
+    count = animate.film(*pair, tmp_path / "f.gif", progress=lambda done, total: told.append((done, total)))
+    with Image.open(tmp_path / "f.gif") as film:
+        assert film.n_frames == count == 11  # both ends shown
+        assert film.info["duration"] * (count - 1) == 400
+    assert told == [(i, 11) for i in range(1, 12)]
+    assert abs(float(pair[1][0].time[-1]) - 0.4) < 1e-12
+
+
+def test_a_frame_shows_both_bobs_where_they_are(pair):
+    """The lower bobs' colours at their positions by diffrax, in the picture of the last frame."""
+    pendulum, motions = pair
+    *_, last = animate._frames(pendulum, motions)
+    for motion, colour in zip(motions, animate.COLOURS, strict=False):
+        start = dpend.released(motion.state.theta1[0], motion.state.theta2[0])
+        end = dpend.reference(pendulum, start, [0.4]).state
+        where = dpend.positions(pendulum, end)
+        reach = 1.1 * 0.4
+        column, row = (
+            int(480 * (0.5 + sign * float(x[-1]) / (2 * reach))) for x, sign in ((where.x2, 1), (where.y2, -1))
+        )
+        expected = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert np.abs(last[row, column].astype(int) - expected).max() < 12
+
+
+def test_a_strobe_darkens_towards_the_end(pair, tmp_path):
+    pendulum, motions = pair
+    assert animate.film(pendulum, motions[:1], tmp_path / "s.png") == 11
+    with Image.open(tmp_path / "s.png") as file:
+        picture = np.asarray(file.convert("L"))
+
+    def darkness(index):
+        state = dpend.State(*(leaf[index] for leaf in (motions[0].state.theta1, motions[0].state.theta2)), 0.0, 0.0)
+        where = dpend.positions(pendulum, state)
+        column = int(picture.shape[1] * (0.5 + float(where.x2) / 0.88))
+        row = int(picture.shape[0] * (0.5 - float(where.y2) / 0.88))
+        return 255 - int(picture[row, column])
+
+    assert darkness(-1) > darkness(-13) > darkness(-25) > 0
+
+
+def test_mp4_needs_its_encoder(pair, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(RuntimeError, match=r"imageio-ffmpeg: pip install 'dpend\[video\]'"):
+        animate.film(*pair, tmp_path / "f.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_mp4(pair, tmp_path):
+    encoder = pytest.importorskip("imageio_ffmpeg")
+    count = animate.film(*pair, tmp_path / "f.mp4")
+    frames, seconds = encoder.count_frames_and_secs(str(tmp_path / "f.mp4"))
+    assert frames == count
+    assert abs(seconds - count / 25) < 0.02
+
+
+def test_an_interrupted_film_leaves_the_old_one(pair, tmp_path):
+    out = tmp_path / "f.gif"
+    out.write_bytes(b"old")
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        animate.film(*pair, out, progress=stop)
+    assert [path.name for path in tmp_path.iterdir()] == ["f.gif"]
+    assert out.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("--theta1 1 --theta1 2 --theta2 1 --duration 1 --out f.gif", "must be given equally often, got 2 and 1"),
+        ("--theta1 1 --theta2 1 --duration 1 --out f.avi", "out must end in .gif or .mp4 or .png"),
+        ("--theta1 1 --theta2 1 --duration 1e9 --out f.gif", "duration must give at most 10000 frames"),
+        ("--theta1 1 --theta2 1 --duration 0 --out f.gif", "duration must be a finite positive number"),
+        ("--theta1 1 --theta2 1 --duration 1 --speed 0 --out f.gif", "speed must be a finite positive number"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line(capsys, monkeypatch, tmp_path, arguments, line):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "_keep_compiled_code", lambda: None)
+    assert cli._run(["animate", *arguments.split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert line in err
+
+
+def test_the_command(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(cli, "_keep_compiled_code", lambda: None)
+    out = tmp_path / "f.gif"
+    command = f"animate --theta1 166 --theta2 177 --duration 0.4 --out {out} --json"
+    assert cli._run(command.split()) == 0
+    found = json.loads(capsys.readouterr().out)
+    with Image.open(out) as film:
+        assert found["frames"] == film.n_frames == 11
+    assert found["motions"][0]["status"] == "converged"
