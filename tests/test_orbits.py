@@ -153,7 +153,7 @@ def test_small_swings_are_the_normal_modes(paper):
     [
         # l2/l1, m2/m1 and where the in-phase branch turns back, and turns again [deg].
         ((1.0, 0.1), (17.77, 5.43)),
-        ((1.0, 0.01), (3.07, 0.60)),
+        pytest.param((1.0, 0.01), (3.07, 0.60), marks=pytest.mark.slow),
         ((10.0, 1.0), (46.57, 24.30)),
     ],
 )
@@ -201,7 +201,13 @@ def test_everything_traces(paper):
         np.testing.assert_allclose(many.period[i], single.period, rtol=1e-11)
 
 
-@pytest.mark.parametrize("request_", [{"branch": "in-phase"}, {"guess": (2.0855, 1.2833), "symmetry": "brake"}])
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {"branch": "in-phase"},
+        pytest.param({"guess": (2.0855, 1.2833), "symmetry": "brake"}, marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_are_those_of_the_root(paper, request_):
     """Implicit derivatives of theta2, the period, the energy and kappa against re-solved orbits."""
     theta1 = np.radians(40.0)

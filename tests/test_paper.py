@@ -1,6 +1,7 @@
 """The paper's numbers: every verdict pinned, and the committed table the one that is computed."""
 
 import csv
+import subprocess
 import sys
 from pathlib import Path
 
@@ -133,3 +134,24 @@ def test_every_verdict_and_the_committed_table():
 def test_the_rough_line_is_a_slope():
     time = np.linspace(0.0, 4.0, 401)
     assert abs(numbers.rough_slope(time[1:], 2.5 * time[1:]) - 2.5) < 1e-12
+
+
+@pytest.mark.slow
+def test_the_script_draws(tmp_path):
+    command = [
+        sys.executable,
+        EXPERIMENTS / "paper.py",
+        "--quick",
+        "--out",
+        tmp_path,
+        "--claims",
+        tmp_path / "claims.csv",
+    ]
+    subprocess.run(command, check=True, capture_output=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "claims.csv",
+        *(f"figure_{number:02d}.png" for number in (1, 2, 11, 46, 48)),
+        "paper.pdf",
+    ]
+    with (tmp_path / "claims.csv").open() as file:
+        assert [row["quantity"] for row in csv.DictReader(file)] == [claim.quantity for claim in numbers.claims()]

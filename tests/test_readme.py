@@ -13,6 +13,6 @@ def test_printed_output_is_true(capsys):
 
 
 def test_every_file_it_names_is_there():
-    names = re.findall(r"\]\(([^):]+)\)", README.read_text())
+    names = re.findall(r"\]\(([^):#]+)(?:#[^)]*)?\)", README.read_text())
     assert names
     assert [name for name in names if not (README.parent / name).is_file()] == []

@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.stats import ks_2samp
 
 import dpend
 from dpend import Pendulum, Status, chaos, sweeps
@@ -212,3 +213,20 @@ def test_bad_sweeps_are_refused(paper):
             dpend.sweep(**({"quantity": LYAPUNOV, "pendulum": paper, "axes": axes} | settings))
     with pytest.raises(ValueError, match="g must not be zero for a tolerance"):
         dpend.sweep(LYAPUNOV, Pendulum(g=0.0), axes)
+
+
+@pytest.mark.slow
+def test_chaotic_exponents_agree_in_distribution(paper):
+    """Where two passes part, cells differ, and the exponents are drawn from one distribution all the same."""
+    side = np.pi * (np.arange(64) + 0.5 - 32) / 32
+    quantity = partial(chaos.lyapunov, duration=8.0)
+    coarse, fine = (
+        dpend.sweep(quantity, paper, {"theta1": side, "theta2": side}, tolerance=tolerance).lyapunov.values.ravel()
+        for tolerance in (1e-4, 1e-8)
+    )
+    chaotic = np.abs(coarse - fine) > 0.05
+    assert np.sum(chaotic) > 1000
+    # Half the cells are the others' mirror images.
+    half = chaotic.copy()
+    half[half.size // 2 :] = False
+    assert ks_2samp(coarse[half], fine[half]).pvalue > 0.01
