@@ -84,6 +84,44 @@ RK8 = Tableau(
 )
 # fmt: on
 
+# The 15-stage method of order 10 of Stepanov, On Runge-Kutta methods of order 10, arXiv 2504.17329 (2025); coefficients
+# as in rklib's rks10.
+# fmt: off
+RK10 = Tableau(
+    a=(
+        (),
+        (0.13333333333333333,),
+        (0.0, 0.26666666666666666),
+        (0.1, 0.0, 0.3),
+        (0.13411078717201166, 0.0, 0.08746355685131195, 0.3498542274052478),
+        (0.32865893899779125, 0.0, -0.8431230447116361, 1.2303830647211609, 0.0628218025289758),
+        (0.13018699084453347, 0.0, 0.0, 0.5807389729173741, -0.13206101704292822, 0.06375081152134318),
+        (0.11696914466403235, 0.0, 0.0, 0.804791321585223, -1.0324424073033935, 0.14123750757742515,
+         0.8519720954414453),
+        (0.07230137681531805, 0.0, 0.0, 0.27844935379385793, -0.7203557425293995, 0.07147830972300757,
+         0.48054612710039024, -0.06494708686790669),
+        (-0.0336045800754256, 0.0, 0.0, -0.8576693886686749, 2.054105395119576, -0.20990904266184918,
+         -1.3339722359516115, 0.18080634838458134, 0.31771584188867136),
+        (0.03781005386193373, 0.0, 0.0, 0.04559155864157964, 0.37485824729474737, -0.018981904165238088,
+         -0.3360388626375594, 0.04220771637555915, 0.05190036098369083, 0.1600370714049642),
+        (0.025378474265434523, 0.0, 0.0, 0.3623063275434741, -2.13002206625995, 0.1672715948594377,
+         1.5827509418646633, -0.20472018513908158, 0.3192653281448061, -0.19948525625469693, 0.43463908273559),
+        (0.02102955512349265, 0.0, 0.0, -0.20853138834469356, 0.32686349865476766, -0.04029159506346634,
+         -0.06216857011008511, 0.019401511635634607, 0.0336189343221497, 0.184057539066669, 0.12671904245006307,
+         0.2419172305057909),
+        (0.05901543960114423, 0.0, 0.0, 0.34675352940043946, -0.5435204392509414, 0.06699832051343939,
+         -0.2091059262738907, 0.03419681921537739, 0.656808691640117, -0.5300230864912716, 0.6823707136215755,
+         -0.5243167946491541, 0.8433503946378972),
+        (-0.04044086632866268, 0.0, 0.0, -0.9361744121603922, 1.4674109549590162, -0.18088384977898705,
+         1.1675891022744105, -0.28011360481035336, -1.8716683763485165, 2.2415881161250515, -1.5725720826914185,
+         2.151700399601059, -1.8133404509027644, 0.6669050700615575),
+    ),
+    b=(0.03333333333333333, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.13516962724923107, 0.054067850899692425,
+       0.21577825773602247, 0.06165093078172071, 0.2774291885177432, 0.1892374781489235, 0.03333333333333333),
+    order=10,
+)
+# fmt: on
+
 # Up to this many stages are written out, the zeros of the tableau left out with them. Beyond it the stages run as a
 # loop unless a scheme says otherwise: order 8 written out takes XLA six times as long to compile and runs 1.5 times as
 # fast for one trajectory, but several times as fast for many at once.
@@ -302,6 +340,7 @@ METHODS = {
     "rk4-circle": _Method(RK4, True),
     "rk8-circle": _Method(RK8, True),
     "rk8-circle-rescaled": _Method(RK8, True, even=False),
+    "rk10-circle-rescaled": _Method(RK10, True, even=False),
 }
 # A release near the bottom swings slowly and evenly: it is given longer steps, in proportion to (energy above the
 # bottom)^-0.2, at most these times as long. Measured on releases over the whole square.
@@ -314,8 +353,8 @@ class Scheme:
 
     Attributes:
         name: `rk4` (the classical method of order 4) or `rk8` (the 12-stage order-8 propagator of DOP853), both in
-            (theta, p); `rk4-circle` and `rk8-circle`, the same without trigonometry; `rk8-circle-rescaled`, that in
-            rescaled time.
+            (theta, p); `rk4-circle` and `rk8-circle`, the same without trigonometry; `rk8-circle-rescaled` and
+            `rk10-circle-rescaled` (15 stages, order 10, by Stepanov), in rescaled time.
         step: the step [s]. Even methods take n = ceil(t/step) steps of t/n each over a motion of length t; the
             rescaled one takes steps of at most `step`, near the bottom 1.9 `step`, much shorter where it flies.
         written_out: whether all stages of an order-8 step in (theta, p) are written out: slower to compile, faster for
@@ -438,41 +477,52 @@ class Scheme:
         return math.ceil(count - 1e-9)
 
 
-# For `rk8-circle-rescaled`, the step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]:
-# 99th percentile over 64 x 64 releases from rest on the whole square, after 2 s of the paper's pendulum, nearly two
-# periods of its slow mode (experiments/sweep_speed.py). At no error was another method faster.
-_ERROR_OF_STEP = (
-    (0.09, 2.0e-11),
-    (0.10, 2.6e-11),
-    (0.115, 5.8e-11),
-    (0.13, 1.5e-10),
-    (0.15, 4.7e-10),
-    (0.17, 1.3e-9),
-    (0.20, 5.1e-9),
-    (0.23, 1.8e-8),
-    (0.26, 5.0e-8),
-    (0.30, 1.6e-7),
-    (0.35, 5.9e-7),
-    (0.40, 1.7e-6),
-    (0.47, 6.6e-6),
-    (0.55, 2.1e-5),
-    (0.65, 1.5e-4),
-    (0.80, 1.7e-3),
-    (1.00, 3.1e-2),
-)
+# The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th percentile over
+# 64 x 64 releases from rest on the whole square, after 2 s of the paper's pendulum, nearly two periods of its slow mode
+# (experiments/sweep_speed.py). At no error was another method faster.
+_ERROR_OF_STEP = {
+    "rk8-circle-rescaled": (
+        (0.17, 1.3e-9),
+        (0.20, 5.1e-9),
+        (0.23, 1.8e-8),
+        (0.26, 5.0e-8),
+        (0.30, 1.6e-7),
+        (0.35, 5.9e-7),
+        (0.40, 1.7e-6),
+        (0.47, 6.6e-6),
+        (0.55, 2.1e-5),
+        (0.65, 1.5e-4),
+        (0.80, 1.7e-3),
+        (1.00, 3.1e-2),
+    ),
+    "rk10-circle-rescaled": (
+        (0.15, 2.0e-11),
+        (0.16, 2.6e-11),
+        (0.18, 3.8e-11),
+        (0.20, 8.8e-11),
+        (0.225, 2.8e-10),
+        (0.25, 8.1e-10),
+        (0.28, 2.6e-9),
+        (0.31, 7.3e-9),
+        (0.35, 2.9e-8),
+        (0.40, 1.2e-7),
+    ),
+}
+# Below this error [rad] order 10 is the faster, by 1.2 at 3e-11; above it they are alike, and order 8 compiles sooner.
+_ORDER_10_BELOW = 2e-8
 
 # How much shorter the step has to be for other pendulums than the paper's, whose masses are equal: against m2/m1, from
-# the error at one step on the same releases; and at lengths l2/l1 = 0.25 to 4 at most by (l2/l1)^0.1.
+# the error at one step on the same releases; and at lengths l2/l1 = 0.25 to 4 at most by (l2/l1)^0.15.
 _SHORTER_FOR_MASSES = (
     (0.01, 0.60),
     (0.03, 0.68),
     (0.1, 0.77),
     (0.3, 0.91),
     (1.0, 1.0),
-    (3.0, 0.77),
-    (10.0, 0.48),
-    (30.0, 0.32),
-    (100.0, 0.22),
+    (3.0, 0.73),
+    (10.0, 0.46),
+    (30.0, 0.28),
+    (100.0, 0.17),
 )
 
 
@@ -493,9 +543,10 @@ def scheme_for(pendulum: Pendulum, tolerance: float) -> Scheme:
     frequency = float(fast_frequency(pendulum))
     if not frequency > 0:
         raise ValueError(f"g must not be zero for a tolerance, got {float(pendulum.g)}: give a method and a step")
-    turns, errors = zip(*_ERROR_OF_STEP, strict=True)
+    name = "rk10-circle-rescaled" if tolerance < _ORDER_10_BELOW else "rk8-circle-rescaled"
+    turns, errors = zip(*_ERROR_OF_STEP[name], strict=True)
     turn = math.exp(np.interp(math.log(tolerance), np.log(errors), np.log(turns)))
     ratios, factors = zip(*_SHORTER_FOR_MASSES, strict=True)
     turn *= math.exp(np.interp(math.log(pendulum.m2 / pendulum.m1), np.log(ratios), np.log(factors)))
-    turn *= min(1.0, float(pendulum.l2 / pendulum.l1)) ** 0.1
-    return Scheme("rk8-circle-rescaled", turn / frequency)
+    turn *= min(1.0, float(pendulum.l2 / pendulum.l1)) ** 0.15
+    return Scheme(name, turn / frequency)
