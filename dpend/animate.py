@@ -32,6 +32,8 @@ _TRAIL = 0.6
 _PIXELS = 480  # a multiple of 16, as video codecs want it
 # Beyond this a GIF is hundreds of megabytes, and no one waits for it.
 _MOST_FRAMES = 10_000
+# A few seconds of computing for each release.
+_MOST_STEPS = 1e7
 
 
 def motions_for(
@@ -48,12 +50,22 @@ def motions_for(
         ValueError: duration or speed not positive; more than 10 000 frames.
     """
     interval = float(number("speed", speed, positive=True)) / FRAMES_PER_SECOND
-    frames = math.ceil(float(number("duration", duration, positive=True, unit="s")) / interval - 1e-9)
-    if frames > _MOST_FRAMES:
+    duration = float(number("duration", duration, positive=True, unit="s"))
+    if not interval <= duration:
+        raise ValueError(f"speed must show the motion of {duration:g} s for a frame at least, got {speed:g}: lower it")
+    count = duration / interval if interval > 0 else math.inf
+    if count > _MOST_FRAMES:
         raise ValueError(
-            f"duration must give at most {_MOST_FRAMES} frames, got {frames}: give a shorter one, or a higher speed"
+            f"duration must give at most {_MOST_FRAMES} frames, got {count:.3g}: give a shorter one, or a higher speed"
         )
-    every = max(1, math.ceil(interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)))
+    frames = math.ceil(count - 1e-9)
+    substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
+    if not frames * substeps <= _MOST_STEPS:
+        raise ValueError(
+            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {frames * substeps:.3g}: "
+            "give a shorter one, or another pendulum"
+        )
+    every = max(1, math.ceil(substeps))
     step = interval / (_SAVED * every)
     return [simulate(pendulum, release, frames * interval, step=step, save_every=every) for release in releases]
 
@@ -76,7 +88,7 @@ def film(
         RuntimeError: .mp4 without imageio-ffmpeg.
     """
     check_out(out)
-    if not motions or any(motion.time.shape != motions[0].time.shape for motion in motions):
+    if not motions or not all(np.array_equal(motion.time, motions[0].time) for motion in motions):
         raise ValueError(f"motions must be at least one, saved at the same times, got {len(motions)}: see motions_for")
     with replacing(out) as draft:
         return _WRITERS[out.suffix](pendulum, motions, draft, progress or (lambda done, total: None))

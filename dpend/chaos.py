@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 
 from dpend.events import first_crossing
-from dpend.pendulum import Pendulum, Scalar, State, energy_scale, fast_frequency, hamiltonian
+from dpend.pendulum import Pendulum, Scalar, State, energy_scale, fast_frequency, hamiltonian, number
 from dpend.steppers import Scheme
 from dpend.trajectory import fold
 
@@ -94,8 +94,9 @@ def lyapunov(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     Returns:
         `lyapunov` [1/s] and `steps`.
     Raises:
-        ValueError: as `flow`.
+        ValueError: duration not positive; as `flow`.
     """
+    duration = float(number("duration", duration, positive=True, unit="s"))
 
     size = norm(pendulum)
     count, tangent = fold(_grown, _NONE, pendulum, state, duration, scheme, tangents=size.vector(*GENERIC))
@@ -122,6 +123,7 @@ def maximal_lyapunov(
     Raises:
         ValueError: windows odd or too few; as `flow`.
     """
+    duration = float(number("duration", duration, positive=True, unit="s"))
     if windows < 4 or windows % 2:
         raise ValueError(f"windows must be an even number of at least 4, got {windows}")
     size = norm(pendulum)
@@ -162,8 +164,9 @@ def spectrum(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     Returns:
         `exponent1` to `exponent4` [1/s] and `steps`.
     Raises:
-        ValueError: as `flow`.
+        ValueError: duration not positive; as `flow`.
     """
+    duration = float(number("duration", duration, positive=True, unit="s"))
     size = norm(pendulum)
 
     def orthogonal(index: Scalar, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -205,8 +208,9 @@ def megno(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) 
     Returns:
         `megno`, without dimension, and `steps`.
     Raises:
-        ValueError: as `flow`.
+        ValueError: duration not positive; as `flow`.
     """
+    duration = float(number("duration", duration, positive=True, unit="s"))
     size = norm(pendulum)
 
     def update(carry, time, dt, state, tangent):  # type: ignore[no-untyped-def]
@@ -251,8 +255,9 @@ def flip(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -
     Returns:
         `flip_time` [s], infinite if there is none; `bob`, 1 or 2, or 0; and `steps`.
     Raises:
-        ValueError: as `flow`.
+        ValueError: duration not positive; as `flow`.
     """
+    duration = float(number("duration", duration, positive=True, unit="s"))
     crossing = first_crossing(_upright, pendulum, state, duration, scheme)
     lost = jnp.isnan(crossing.state.theta1 + crossing.state.theta2)
     time = jnp.where(lost, jnp.nan, crossing.time)
@@ -270,7 +275,7 @@ def drift(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) 
     Returns:
         `energy_drift`, without dimension, and `steps`.
     Raises:
-        ValueError: as `flow`.
+        ValueError: duration not positive; as `flow`.
     """
     start = hamiltonian(pendulum, state)
 

@@ -17,7 +17,7 @@ from dpend.pendulum import Pendulum, Scalar, State, vector_field
 from dpend.steppers import Scheme
 from dpend.trajectory import fold
 
-# Newton's method from the middle of a step needs five or six; each bisection of the bracket takes one more.
+# Newton's method from the end of a step needs five or six; each bisection of the bracket takes one more.
 _MOST_ITERATIONS = 40
 # Of the step: an update this small leaves, squared, nothing for the next.
 _TIME_TOLERANCE = 1e-8
@@ -68,7 +68,8 @@ def first_crossing(
     Arguments:
         functions: (pendulum, state) -> one scalar, or a tuple of scalars each of which is watched; smooth where it
             crosses. Compiled functions are kept by its identity: define it once, not in a loop.
-        pendulum, state, duration, scheme: as for `flow`.
+        pendulum, state, scheme: as for `flow`.
+        duration: how long to look [s], a number; negative runs backwards.
         direction: 1 counts crossings from below only, -1 from above only, 0 both.
     Returns:
         Crossing.
@@ -105,6 +106,7 @@ def _first_crossing(functions, pendulum, state, duration, scheme, direction):  #
         time, dt = jnp.where(search.found, search.time, time), jnp.where(search.found, search.dt, dt)
         return _Search(found, values, before, time, dt, search.steps + 1.0)
 
+    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), state)
     zero = jnp.zeros_like(state.theta1)
     start = _Search(zero > 0, _values(functions, pendulum, state), state, zero, zero, zero)
     search = fold(look, start, pendulum, state, duration, scheme)
@@ -117,7 +119,7 @@ def _values(functions: Callable[[Pendulum, State], Any], pendulum: Pendulum, sta
 
 def _crossed(before: jax.Array, after: jax.Array, direction: int) -> jax.Array:
     """Where the sign has changed in the direction asked for; a start at zero and NaN are no change."""
-    changed = (before * after <= 0) & (before != 0)
+    changed = (jnp.sign(before) * jnp.sign(after) <= 0) & (before != 0)  # the values' product may underflow
     return changed if direction == 0 else changed & (before * direction < 0)
 
 
@@ -144,7 +146,8 @@ def _landed(functions, pendulum, search, scheme, direction):  # type: ignore[no-
         there = jnp.where(here == 0, tau, tau - here / slopes)
         aims = jnp.where(among, sense * there, jnp.inf)
         aims = jnp.where(aims >= sense * low, aims, jnp.inf)
-        which = jnp.argmin(aims)
+        soonest = jnp.argmin(aims)
+        which = jnp.where(aims[soonest] < jnp.inf, soonest, jnp.argmax(among))
         aim = jnp.where(aims[which] < jnp.inf, sense * jnp.minimum(aims[which], sense * high), 0.5 * (low + high))
         # One evaluation more than the updates need: the state belongs to the time.
         aim = jnp.where(carry.close, tau, aim)
@@ -154,7 +157,8 @@ def _landed(functions, pendulum, search, scheme, direction):  # type: ignore[no-
     def goes_on(carry: _Landing) -> Scalar:
         return search.found & ~carry.done & (carry.count < _MOST_ITERATIONS)
 
-    tau = jnp.where(search.found, 0.5 * search.dt, 0.0)
+    # The step's end is tried first: it tells which functions cross.
+    tau = jnp.where(search.found, search.dt, 0.0)
     among, no = jnp.ones_like(start, bool), jnp.zeros_like(search.found)
     first = _Landing(0.0 * tau, search.dt, tau, among, jnp.asarray(0), search.before, no, no, jnp.asarray(0))
     landing = lax.while_loop(goes_on, newton, first)

@@ -155,6 +155,8 @@ def _float64(tree: Any) -> Any:
 
 def known_value(value: Scalar) -> float | None:
     """The number behind `value`, also under eager differentiation; None where it is traced."""
+    if isinstance(value, (int, float)):  # NumPy's float64 too: under `jit`, stop_gradient would trace it
+        return float(value)
     try:
         return float(lax.stop_gradient(value))
     except jax.errors.ConcretizationTypeError:
@@ -162,8 +164,8 @@ def known_value(value: Scalar) -> float | None:
 
 
 # A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns ten thousand times
-# as fast as any that gravity moves: the lane is given up, so that no other waits for it.
-_SHORTEST_STEP = 1e-4
+# as fast as any that gravity moves: the lane is given up as NaN, so that no other waits for it.
+_SHORTEST_STEP = 1e-5
 
 
 class _Along(NamedTuple):
@@ -238,6 +240,9 @@ def _unevenly(update, pendulum, state, along, duration, scheme):  # type: ignore
         return _Along(ahead.point, *kept), time, spin
 
     time = jnp.zeros_like(state.theta1)
+    # A duration that is not finite leaves nothing of the start.
+    point = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(duration), leaf, jnp.nan), along.point)
+    along = along._replace(point=point)
     carried = along, time, scheme.spin(unit, along.point)
     along, _, _ = lax.while_loop(lambda carried: _any_lane(goes(carried[1])), advance, carried)
     return scheme.leave(unit, along.point), along.tangents, along.carry
@@ -312,7 +317,9 @@ def _accumulate(update, init, pendulum, state, tangents, duration, scheme):  # t
     elif known is not None:
         steps = scheme.steps(known)
     else:
-        steps = jnp.maximum(jnp.ceil(jnp.abs(duration) / scheme.step - 1e-9), 1).astype(int)
+        # A duration that is not finite takes one step, into NaN.
+        count = jnp.where(jnp.isfinite(duration), jnp.abs(duration), 0.0) / scheme.step
+        steps = jnp.maximum(jnp.ceil(count - 1e-9), 1).astype(int)
     compiled = _fold if isinstance(steps, int) else _fold_traced
     init = jax.tree.map(_weakly_float64, init)
     time = jnp.asarray(duration, jnp.float64)

@@ -287,8 +287,10 @@ class Table:
 
     def read(self, section, quantity, printed, name, value, unit="", reason=""):  # type: ignore[no-untyped-def]
         """A number that `value` reads off the motion of a case; its error, the change at half the sampling step."""
+        # Angles are read in radians, and told in the degrees of their mode.
         as_printed, true, finer = (
-            value(motion_of(name, *which)) for which in (("as printed",), ("true",), ("true", 2))
+            value(motion_of(name, *which)) / (DEGREE[which[0]] if unit == "deg" else 1.0)
+            for which in (("as printed",), ("true",), ("true", 2))
         )
         self.number(section, quantity, printed, as_printed, true, abs(finer - true), unit, reason)
 
@@ -367,9 +369,6 @@ def case_a(table: Table) -> None:
     def below(name: str) -> Callable[[Motion], float]:
         return lambda motion: motion.at(name, bottom(motion, 1 if name.endswith("1") else 2))
 
-    def degrees(name: str, sign: int = 1) -> Callable[[Motion], float]:
-        return lambda motion: sign * math.degrees(there(name)(motion))
-
     read = partial(table.read, "A", name="A")
     points = [motion_of("A", mode).until(2.9905).every(0.01).time.size for mode in MODES]
     table.number("A", "points of figure 2", "300", *points, 0.0)
@@ -386,8 +385,8 @@ def case_a(table: Table) -> None:
     read("time of KE1's second peak", "0.45", value=lambda m: float(peaks(m.time, m.kinetic1)[1]), unit="s")
     read("time of the rest, KE1 = 0", "0.63", value=lambda m: rest(m, 1), unit="s")
     why = "at KE1's peak, where the upper rod starts to brake"
-    read("theta1 between the first two stages", "31.5", value=degrees("theta1"), unit="deg", reason=why)
-    read("theta2 between the first two stages", "57.3", value=degrees("theta2"), unit="deg", reason=why)
+    read("theta1 between the first two stages", "31.5", value=there("theta1"), unit="deg", reason=why)
+    read("theta2 between the first two stages", "57.3", value=there("theta2"), unit="deg", reason=why)
     read("theta1 between the first two stages", "0.55", value=there("theta1"), unit="rad")
     read("theta2 between the first two stages", "1.00", value=there("theta2"), unit="rad", reason=why)
 
@@ -396,7 +395,7 @@ def case_a(table: Table) -> None:
 
     for name, printed, size in (("theta1", "-31.5", "-0.55"), ("theta2", "-57.3", "-1.00")):
         where = f"{name} between the last two stages"
-        read(where, printed, value=lambda m, name=name: math.degrees(later(name)(m)), unit="deg", reason=why)
+        read(where, printed, value=later(name), unit="deg", reason=why)
         read(where, size, value=later(name), unit="rad", reason=why)
     for name in ("theta1", "theta2"):
 
@@ -404,7 +403,7 @@ def case_a(table: Table) -> None:
             return motion.at(name, rest(motion, int(name[-1])))
 
         read(f"{name} at the end of the half period", "-1.12", value=turned, unit="rad")
-        read(f"{name} at the end of the half period", "-64.3", value=lambda m, t=turned: math.degrees(t(m)), unit="deg",
+        read(f"{name} at the end of the half period", "-64.3", value=turned, unit="deg",
              reason="it swings to the mirror image of its own release")  # fmt: skip
 
 
@@ -553,7 +552,8 @@ def exponents(table: Table) -> None:
     }
     time, running, converged = running_exponent()
     settled = float(time[np.abs(running / converged["exponent"] - 1) > 0.1].max()) + 1.0
-    why = f"a value of 4 s; the converged exponent is {converged['exponent']:.2f} +- {converged['uncertainty']:.2f}/s"
+    bound = math.ceil(100 * converged["uncertainty"]) / 100
+    why = f"a value of 4 s; the converged exponent is {converged['exponent']:.2f} +- {bound:.2f}/s"
     for name, fit in fits.items():
         slopes = [fit(*logs[mode]) for mode in MODES]
         finer = fit(*separation("true", 2)[:2])

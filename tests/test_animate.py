@@ -95,6 +95,9 @@ def test_an_interrupted_film_leaves_the_old_one(pair, tmp_path):
         ("--theta1 1 --theta2 1 --duration 1e9 --out f.gif", "duration must give at most 10000 frames"),
         ("--theta1 1 --theta2 1 --duration 0 --out f.gif", "duration must be a finite positive number"),
         ("--theta1 1 --theta2 1 --duration 1 --speed 0 --out f.gif", "speed must be a finite positive number"),
+        ("--theta1 1 --theta2 1 --duration 1 --speed 1e12 --out f.gif", "speed must show the motion of 1 s"),
+        ("--theta1 1 --theta2 1 --duration 1e300 --speed 1e-300 --out f.gif", "must give at most 10000 frames"),
+        ("--theta1 1 --theta2 1 --duration 1 --g 1e30 --out f.gif", "duration must take at most 1e+07 steps"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line(capsys, monkeypatch, tmp_path, arguments, line):

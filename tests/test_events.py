@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,3 +69,38 @@ def test_backwards_and_never(paper):
 def test_direction_is_checked(paper):
     with pytest.raises(ValueError, match="direction must be -1, 0 or 1, got 2"):
         dpend.first_crossing(lower, paper, dpend.released(0.5, 0.2), 1.0, Scheme("rk8", 1e-2), direction=2)
+
+
+@pytest.mark.parametrize("name", ["rk8-circle-rescaled", pytest.param("rk4", marks=pytest.mark.slow)])
+def test_what_does_not_count_is_passed_by(paper, name):
+    """In one step a falling function, which does not count, and a rising one: over many releases, always the latter."""
+    release = jnp.linspace(0.9, 1.1, 101)
+    scheme = Scheme(name, 0.02 if name != "rk4" else 5e-3)
+
+    def find(functions, direction):
+        def one(angle):
+            start = dpend.released(angle, angle)
+            return dpend.first_crossing(functions, paper, start, 0.5, scheme, direction=direction)
+
+        return jax.vmap(one)(release)
+
+    def two(pendulum, state):
+        return state.theta1 - 0.5, 0.49 - state.theta1
+
+    def touching(pendulum, state):
+        return (state.theta1 - 0.5) ** 2, state.theta1 - 0.49
+
+    alone = find(lambda pendulum, state: 0.49 - state.theta1, 1)
+    for functions, direction in ((two, 1), (touching, 0)):
+        found = find(functions, direction)
+        np.testing.assert_array_equal(found.which, 1)
+        np.testing.assert_allclose(found.time, alone.time, rtol=0, atol=1e-9)
+
+
+def test_tiny_values_cross_where_they_cross(paper):
+    """The product of two values below 1e-162 is zero, and no change of sign."""
+    found = dpend.first_crossing(
+        lambda pendulum, state: 1e-170 * state.theta1, paper, dpend.released(0.5, 0.5), 1.0, Scheme("rk8-circle", 0.02)
+    )
+    plain = dpend.first_crossing(lower, paper, dpend.released(0.5, 0.5), 1.0, Scheme("rk8-circle", 0.02))
+    assert abs(found.time - plain.time) < 1e-12

@@ -35,7 +35,6 @@ DIFFERS = {
     ("A", "theta1 between the last two stages", "-31.5"),
     ("A", "theta2 between the last two stages", "-57.3"),
     ("A", "theta2 between the last two stages", "-1.00"),
-    ("A", "theta1 at the end of the half period", "-64.3"),
     ("C", "theta2 that belongs to theta1 = 10 deg"),
     ("C", "period"),
     ("C", "theta2 is exactly 10 sqrt 2 deg"),

@@ -191,3 +191,17 @@ def test_dataset_has_units_and_degrees(paper):
         "theta1": "rad", "p2": "kg m^2/s", "time": "s", "theta1_deg": "degree"
     }  # fmt: skip
     np.testing.assert_allclose(np.radians(data.theta2_deg), data.theta2, rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["rk8", "rk8-circle-rescaled"])
+@pytest.mark.parametrize("duration", [np.nan, np.inf])
+def test_a_traced_duration_that_is_not_finite_leaves_nothing(paper, name, duration):
+    end = jax.jit(lambda time: dpend.flow(paper, RELEASE, time, Scheme(name, 1e-2)))(duration)
+    assert np.all(np.isnan(leaves(end)))
+
+
+def test_reverse_mode_under_jit(paper):
+    def angle(theta1):
+        return dpend.flow(paper, dpend.released(theta1, 2.0), 0.5, Scheme("rk4", 1e-2)).theta1
+
+    assert abs(jax.jit(jax.grad(angle))(1.0) - jax.jacfwd(angle)(1.0)) < 1e-12
