@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dpend.pendulum import Pendulum, State, fast_frequency, number, positions
-from dpend.plots import check_place, replacing
+from dpend.plots import LOWER, UPPER, check_place, replacing
 from dpend.trajectory import Trajectory, simulate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Okabe and Ito's palette, told apart by the colour-blind; its yellow is too pale for a line on white.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+COLOURS = (UPPER, LOWER, "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 # GIFs tell time in hundredths of a second, and 25 a second is the fastest rate in whole ones that players keep.
 FRAMES_PER_SECOND = 25
 # In one step the fast mode advances by this [rad]: order 8 is then right far below a pixel, for as long as the motion
@@ -39,15 +39,16 @@ _MOST_STEPS = 1e7
 def motions_for(
     pendulum: Pendulum, releases: Sequence[State], duration: float, *, speed: float = 1.0
 ) -> list[Trajectory]:
-    """The motions from `releases`, saved once a frame.
+    """The motions from `releases`, saved four times a frame.
 
     Arguments:
         duration: of the motion [s], positive; rounded up to whole frames.
         speed: seconds of the motion in a second of the film; 1 is real time.
     Returns:
-        Trajectories with equal times, four in each frame. Their status says whether their end may be believed.
+        Trajectories with equal times. Their status says whether their end may be believed.
     Raises:
-        ValueError: duration or speed not positive; more than 10 000 frames.
+        ValueError: duration or speed not positive; a speed at which the motion does not last for a frame; more than
+            10 000 frames, or 1e7 steps.
     """
     interval = float(number("speed", speed, positive=True)) / FRAMES_PER_SECOND
     duration = float(number("duration", duration, positive=True, unit="s"))

@@ -38,8 +38,10 @@ from paper_numbers import (
     write_claims,
 )
 
+import dpend
+from dpend.plots import LOWER, NEUTRAL, UPPER
+
 HERE = Path(__file__).parent
-UPPER, LOWER, NEUTRAL = "#0072B2", "#D55E00", "#555555"
 STYLE = {
     "font.size": 9, "axes.titlesize": 9, "axes.spines.top": False, "axes.spines.right": False, "lines.linewidth": 1.0,
     "savefig.dpi": 110,
@@ -116,9 +118,8 @@ def _colour(bob: int) -> str:
 
 
 def _rods(ax, motion: Motion, bobs: tuple = (1, 2), width: float = 0.8) -> None:
-    l1, l2 = float(PAPER.l1), float(PAPER.l2)
-    x1, y1 = l1 * np.sin(motion.theta1), -l1 * np.cos(motion.theta1)
-    x2, y2 = x1 + l2 * np.sin(motion.theta2), y1 - l2 * np.cos(motion.theta2)
+    state = dpend.State(motion.theta1, motion.theta2, motion.p1, motion.p2)
+    x1, y1, x2, y2 = (np.asarray(value) for value in dpend.positions(PAPER, state))
     still = np.zeros_like(x1)
     if 1 in bobs:
         ax.plot(np.stack([still, x1]), np.stack([still, y1]), color=UPPER, linewidth=width, alpha=0.6)
