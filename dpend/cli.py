@@ -25,6 +25,7 @@ from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
 from dpend.plots import check_place, replacing
 from dpend.steppers import METHODS
+from dpend.sweeps import check_store
 from dpend.trajectory import Status, Trajectory
 
 app = typer.Typer(
@@ -184,6 +185,7 @@ def map_command(
         key: _cells(key, text, count)
         for key, text, count in zip(("theta1", "theta2"), (theta1, theta2), _size(size), strict=True)
     }
+    check_store("out", out)
     if figure is not None:
         check_place("figure", figure, (".png",))
     started, counts = time.perf_counter(), [0, 0, 0]
@@ -528,7 +530,8 @@ def _run(arguments: list[str]) -> int:
         jax.config.update("jax_enable_x64", True)
     _keep_compiled_code()
     try:
-        return int(app(arguments or ["--help"], standalone_mode=False) or 0)
+        with np.errstate(all="ignore"):  # what overflows is told by the status or by the line that refuses it
+            return int(app(arguments or ["--help"], standalone_mode=False) or 0)
     except (KeyboardInterrupt, typer.Abort):
         return 130
     except typer.Exit as stop:

@@ -1,7 +1,8 @@
 """Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them) and of maps.
 
-Each function draws into the axes it is given, or into new ones, and returns them; saving is the caller's. Colours are
-from Okabe and Ito's palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion for the lower.
+Each function draws into the axes it is given, or into new ones, and returns them. Whoever writes a file, of whatever
+kind, does so through `check_place`, before anything is computed, and `replacing`. Colours are from Okabe and Ito's
+palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion for the lower.
 """
 
 import contextlib
@@ -16,6 +17,7 @@ import numpy as np
 
 from dpend.orbits import PeriodicOrbit
 from dpend.pendulum import Pendulum, State, energies, positions
+from dpend.sweeps import unwritable
 from dpend.trajectory import Trajectory, simulate
 
 if TYPE_CHECKING:
@@ -222,8 +224,11 @@ def check_place(name: str, path: Path, suffixes: Sequence[str]) -> None:
     """
     if path.suffix not in suffixes:
         raise ValueError(f"{name} must end in {' or '.join(suffixes)}, got {path}: give another name")
-    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ValueError(f"{name} must be a file in a directory that can be written to, got {path}: give another place")
+    reason = "Is a directory" if os.path.isdir(path) else unwritable(path)
+    if reason:
+        raise ValueError(
+            f"{name} must be a file in a directory that can be written to, got {path} ({reason}): give another place"
+        )
 
 
 @contextlib.contextmanager

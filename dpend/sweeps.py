@@ -11,6 +11,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -94,7 +95,8 @@ def sweep(
         xarray.Dataset: the quantity's values, `status` (a value of `Status` for each cell: NONFINITE where a value is
         NaN), coordinates with units, angles also in degrees, and as attributes all that determines the values.
     Raises:
-        ValueError: bad axes, tolerance or method; a store made with other settings, or a directory that is none.
+        ValueError: bad axes, tolerance or method; a store made with other settings, or a directory that is none; no
+            directory to write a store in.
         RuntimeError: a store made by another version of this package; float64 is switched off in JAX.
     """
     require_float64()
@@ -482,15 +484,42 @@ def _labelled(task: _Task, values: dict[str, np.ndarray], attributes: dict[str, 
 # --- the store -------------------------------------------------------------------------------------------------------
 
 
+def unwritable(path: Path) -> str:
+    """Why no new file can be put beside `path`, in the system's words; empty if one can.
+
+    It is tried: permissions do not tell what the root user, a disk mounted for reading or the system's own directories
+    allow, nor how long a name may be.
+    """
+    try:
+        tempfile.NamedTemporaryFile(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent).close()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def check_store(name: str, path: Path) -> None:
+    """Refuses, before anything is computed, a path where there is no store and none could be made.
+
+    Raises:
+        ValueError: something else is there, or no directory to write in. `name` is the argument that is told.
+    """
+    if os.path.exists(path):
+        _attributes(name, path)
+    elif reason := unwritable(path):
+        raise ValueError(
+            f"{name} must be a new name in a directory that can be written to, got {path} ({reason}): "
+            "give another place"
+        )
+
+
 def _stored(task: _Task, path: Path, attributes: dict[str, Any], tell: Callable[[int, int, int], None] | None) -> Any:
     import xarray
     import zarr
 
+    check_store("store", path)
     if not path.exists():
         _create(task, path, attributes)
     _check(path, attributes)
-    for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
-        leftover.unlink()
     # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
     arrays = {
         key: zarr.open_array(path / key, mode="r+").with_config({"write_empty_chunks": True}) for key in _kinds(task)
@@ -502,6 +531,10 @@ def _stored(task: _Task, path: Path, attributes: dict[str, Any], tell: Callable[
             progress.cells += int(np.prod([part.stop - part.start for part in block]))
         else:
             todo.append(block)
+    if todo and not os.access(path, os.W_OK):  # a finished one is only read
+        raise ValueError(f"store must be finished or one that can be written to, got {path}: finish a copy of it")
+    for leftover in path.rglob("*.partial") if todo else ():  # of a process that was killed while it wrote
+        leftover.unlink()
     parities = _parities(task) if todo else None
     for block in todo:
         before = progress.cells
@@ -535,8 +568,6 @@ def _create(task: _Task, path: Path, attributes: dict[str, Any]) -> None:
     """An empty store, under a temporary name until it is whole."""
     import zarr
 
-    if not path.parent.is_dir():
-        raise ValueError(f"store must lie in a directory that exists, got {path}: make {path.parent} first")
     draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
     try:
         grid = task.grid
@@ -570,16 +601,21 @@ def _create(task: _Task, path: Path, attributes: dict[str, Any]) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _check(path: Path, attributes: dict[str, Any]) -> None:
-    """Refuses what is no store, or one of another sweep."""
+def _attributes(name: str, path: Path) -> dict[str, Any]:
+    """A store's attributes; raises as `check_store` does."""
     import zarr
 
     try:
-        found = dict(zarr.open_group(path, mode="r").attrs)
+        return dict(zarr.open_group(path, mode="r").attrs)
     except (FileNotFoundError, ValueError, KeyError, NotADirectoryError):
         raise ValueError(
-            f"store must be a Zarr store of a sweep or a new name, got {path}: give another name"
+            f"{name} must be a Zarr store of a sweep or a new name, got {path}: give another name"
         ) from None
+
+
+def _check(path: Path, attributes: dict[str, Any]) -> None:
+    """Refuses a store of another sweep."""
+    found = _attributes("store", path)
     if found.get("dpend_version") != attributes["dpend_version"]:
         raise RuntimeError(
             f"store {path} was made by version {found.get('dpend_version')} of dpend, this is "

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
+from numbers import Real
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -155,7 +156,7 @@ def _float64(tree: Any) -> Any:
 
 def known_value(value: Scalar) -> float | None:
     """The number behind `value`, also under eager differentiation; None where it is traced."""
-    if isinstance(value, (int, float)):  # NumPy's float64 too: under `jit`, stop_gradient would trace it
+    if isinstance(value, Real):  # NumPy's scalars too: under `jit`, stop_gradient would trace them
         return float(value)
     try:
         return float(lax.stop_gradient(value))

@@ -82,6 +82,11 @@ def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
         (("theta2", "10"), "theta2 must be a range A:B in degrees"),
         (("duration", "-1"), "duration must be a finite positive number"),
         (("figure", "here.pdf"), "figure must end in .png"),
+        (("figure", "/proc/m.png"), "figure must be a file in a directory that can be written to, got /proc/m.png"),
+        (("out", "/proc/m.zarr"), "out must be a new name in a directory that can be written to, got /proc/m.zarr"),
+        (("out", "/no/such/place/m.zarr"), "out must be a new name in a directory that can be written to"),
+        (("out", f"{'m' * 300}.zarr"), "out must be a new name in a directory that can be written to"),
+        (("out", "."), "out must be a Zarr store of a sweep or a new name, got .:"),
         (("method", "rk4"), "step must be given with method"),
         (("error", "all"), "error must be None or"),
     ],
@@ -174,6 +179,36 @@ def test_a_failed_write_leaves_the_old_file(capsys, tmp_path, monkeypatch):
     assert target.read_text() == "old"
 
 
+ANIMATE = ("animate", "--theta1", "10", "--theta2", "20", "--duration", "0.4")
+MAP = ("map", "flip", "--size", "4", "--duration", "0.5")
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"), [(ANIMATE, "out", "old.gif"), (MAP, "out", "old.zarr"), (MAP, "figure", "old.png")]
+)
+def test_where_nothing_can_be_written_the_old_file_stays(capsys, tmp_path, command, option, name):
+    place = tmp_path / "locked"
+    place.mkdir()
+    (place / name).write_text("old")
+    place.chmod(0o555)
+    if os.access(place, os.W_OK):
+        pytest.skip("this user may write anywhere")
+    other = ("--out", tmp_path / "m.zarr") if option == "figure" else ()
+    for file in (name, f"new{Path(name).suffix}"):
+        status, out, err = run(capsys, *command, *other, f"--{option}", place / file)
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert f"{option} must be" in err
+        assert f"got {place / file}" in err
+    assert [path.name for path in place.iterdir()] == [name]
+    assert (place / name).read_text() == "old"
+    assert not (tmp_path / "m.zarr").exists()
+
+
+def test_numbers_that_overflow_bring_no_line_of_their_own(capsys, tmp_path):
+    status, _, err = run(capsys, *ANIMATE, "--l1", "1e300", "--out", tmp_path / "f.gif")
+    assert (status, err.count("\n")) == (2, 1)
+
+
 SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
 
 
@@ -212,6 +247,13 @@ SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
         ((*SIMULATE, "--p1", "nan"), "p1 .*finite"),
         ((*SIMULATE, "--out", "motion.xls"), "out must end in .csv or .nc"),
         ((*SIMULATE, "--out", "/no/such/place/motion.csv"), "out must be a file in a directory"),
+        ((*ANIMATE, "--theta1", "nan", "--theta2", "1", "--out", "f.gif"), "theta1 .*finite number .* nan"),
+        ((*ANIMATE, "--m1", "0", "--out", "f.gif"), "m1 .*positive .* 0"),
+        ((*ANIMATE, "--l2", "-0.2", "--out", "f.gif"), "l2 .*positive .* -0.2"),
+        ((*ANIMATE, "--speed", "fast", "--out", "f.gif"), "--speed.*fast"),
+        ((*ANIMATE, "--out", "/proc/z.gif"), "out must be a file in a directory .* got /proc/z.gif .*another place"),
+        ((*ANIMATE, "--out", f"{'z' * 300}.gif"), "out must be a file in a directory .* got zzz"),
+        ((*ANIMATE, "--out", "."), "out must end in .gif or .mp4 or .png, got .: give another name"),
     ],
 )
 def test_bad_input_is_one_line_and_status_two(capsys, arguments, words):

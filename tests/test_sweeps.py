@@ -143,12 +143,27 @@ def test_a_store_holds_the_map(paper, flips, tmp_path):
         dpend.sweep(FLIP, paper, {"theta1": SIDE, "theta2": SIDE / 2}, store=store)
     with pytest.raises(ValueError, match="must be a Zarr store of a sweep or a new name"):
         dpend.sweep(FLIP, paper, axes, store=tmp_path)
+    with pytest.raises(ValueError, match=r"store must be a new name in a directory .* got /no/such/place/m\.zarr"):
+        dpend.sweep(FLIP, paper, axes, store="/no/such/place/m.zarr")
     with pytest.raises(ValueError, match="name must be given to store a lambda or a closure"):
         dpend.sweep(lambda p, x, s: {"a": x.theta1}, paper, axes, store=tmp_path / "b.zarr")
 
 
 def contents(store):
     return {path.relative_to(store): path.read_bytes() for path in sorted(store.rglob("*")) if path.is_file()}
+
+
+def test_a_store_that_cannot_be_written_to_is_read_if_it_is_finished(paper, tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeps, "_TILE", 7)
+    axes, store = {"theta1": SIDE, "theta2": SIDE}, tmp_path / "map.zarr"
+    field = dpend.sweep(FLIP, paper, axes, store=store)
+    monkeypatch.setattr(sweeps.os, "access", lambda *_: False)
+    assert dpend.sweep(FLIP, paper, axes, store=store).equals(field)
+    (store / "status" / "c" / "0" / "0").unlink()
+    before = contents(store)
+    with pytest.raises(ValueError, match="store must be finished or one that can be written to"):
+        dpend.sweep(FLIP, paper, axes, store=store)
+    assert contents(store) == before
 
 
 def test_an_unfinished_store_is_finished_with_the_same_bytes(paper, tmp_path, monkeypatch):

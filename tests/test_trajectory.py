@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import dpend
 from dpend import Pendulum, Scheme, State, Status
+from dpend.trajectory import known_value
 
 RELEASE = dpend.released(np.radians(100), np.radians(-30))
 RK8 = Scheme("rk8", 4e-3)
@@ -83,6 +84,20 @@ def test_traced_durations_give_the_same_motion(paper):
     np.testing.assert_allclose(leaves(traced), leaves(known), rtol=1e-12)
     many = jax.vmap(lambda duration: dpend.flow(paper, RELEASE, duration, RK8).theta1)(jnp.array([0.3, 0.7]))
     np.testing.assert_allclose(many[1], known.theta1, rtol=1e-13)
+
+
+def test_numbers_are_known_also_while_tracing():
+    known = []
+
+    @jax.jit
+    def look(x):
+        known.extend(known_value(value) for value in (2, 0.5, np.float64(0.5), np.float32(0.5), np.int64(2), x))
+        return x
+
+    look(1.0)
+    assert known == [2.0, 0.5, 0.5, 0.5, 2.0, None]
+    jax.grad(lambda x: known.append(known_value(x)) or x)(0.25)
+    assert known[-1] == 0.25
 
 
 def test_fold_sees_every_step_once(paper):
