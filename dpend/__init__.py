@@ -7,6 +7,9 @@ from dpend import _runtime as _runtime  # sets JAX up: before anything else
 from dpend import chaos as chaos
 from dpend.events import Crossing as Crossing
 from dpend.events import first_crossing as first_crossing
+from dpend.families import Family as Family
+from dpend.families import SpecialPoint as SpecialPoint
+from dpend.families import follow_family as follow_family
 from dpend.orbits import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits import find_orbit as find_orbit
 from dpend.pendulum import BobEnergies as BobEnergies

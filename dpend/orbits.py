@@ -46,25 +46,27 @@ _MOST_STEPS = 200_000
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PeriodicOrbit:
-    """A periodic orbit released from rest, or many of one shape.
+    """A periodic orbit, released from rest unless it is `odd`, or many of one shape.
 
     Attributes:
         pendulum: its pendulum.
-        state: at t = 0, at rest.
+        state: at t = 0, at rest; of an odd orbit where theta1 is at an extreme.
         period: the minimal one [s].
         energy: H [J], zero for both bobs at rest at the pivot's height.
         residual: of the equations solved: angles at T/4 [rad] if centred, else momenta at T/2 in units of
-            m2 l2 sqrt(g l2); the larger of the two.
+            m2 l2 sqrt(g l2); the larger of the two. On a family the largest of all its segments' equations, in units of
+            l1, m1 and g.
         iterations: Newton iterations spent on it, each one integration with its Jacobian and one linear solve; on a
             branch those of the walk's last step and those at the wanted release.
         kappa: half the sum of the two non-trivial Floquet multipliers.
         log_abs_kappa: log |kappa|, natural.
-        dual: the other rest of the orbit, at T/2.
+        dual: the state at T/2, the other rest of the orbit.
         turns: theta(T/4)/pi of a centred orbit, two integers; zeros otherwise.
         error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s]: the change on solving again at half
             the step; NaN if that was not asked for.
         status: a value of `Status`.
-        symmetry: `centred` or `brake`.
+        symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from rest), or `odd`
+            (x(T/2) = -x(0) up to full turns, never at rest; found by `follow_family`).
     """
 
     pendulum: Pendulum

@@ -24,18 +24,20 @@ from dpend.trajectory import march, step_size
 
 def transition(
     pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar, scheme: Scheme
-) -> tuple[State, Float[Array, "4 4"]]:
+) -> tuple[State, Float[Array, "4 4 ..."]]:
     """The state after `steps` steps of `dt` [s] and the derivative of that map, Phi[i, j] = d x_i / d x_j(0).
 
-    Rows and columns are in the order theta1, theta2, p1, p2 and in SI units.
+    Rows and columns are in the order theta1, theta2, p1, p2 and in SI units; of a state with leaves of some shape that
+    shape follows them.
     """
-
     constants = scheme.constants(pendulum, dt)
+    shape = jnp.shape(state.theta1)
+    unit = jnp.broadcast_to(jnp.eye(4).reshape(4, 4, *(1 for _ in shape)), (4, 4, *shape))
 
     def step(pair: tuple[Point, State], time: Scalar, dt: Scalar) -> tuple[Point, State]:
         return scheme.move_tangents(constants, *pair)
 
-    end, tangents = march(step, (scheme.enter(pendulum, state), State(*jnp.eye(4))), dt, steps)
+    end, tangents = march(step, (scheme.enter(pendulum, state), State(*unit)), dt, steps)
     return scheme.leave(constants, end), jnp.stack(jax.tree.leaves(tangents))
 
 

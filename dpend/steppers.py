@@ -137,18 +137,28 @@ def explicit_step(
         for row in tableau.a:
             slopes.append(increment(_displaced(point, row, slopes)))
         return _displaced(point, tableau.b, slopes)
-    weights, final = jnp.asarray(_square(tableau)), jnp.asarray(tableau.b)
+    # Rows, one for each number that a leaf holds for each lane, so that a stage is one pass over contiguous lanes.
     leaves, structure = jax.tree.flatten(point)
-    start = jnp.stack(leaves)
+    lanes = min((jnp.shape(leaf) for leaf in leaves), key=len)
+    ends = np.cumsum([math.prod(jnp.shape(leaf)) // math.prod(lanes) for leaf in leaves])
+
+    def rows(tree: Point) -> jax.Array:
+        return jnp.concatenate([jnp.reshape(leaf, (-1, *lanes)) for leaf in jax.tree.leaves(tree)])
+
+    def tree(table: jax.Array) -> Point:
+        parts = zip(leaves, jnp.split(table, ends[:-1]), strict=True)
+        return jax.tree.unflatten(structure, [jnp.reshape(part, jnp.shape(leaf)) for leaf, part in parts])
+
+    start, stages = rows(point), len(tableau.b)
+    weights = jnp.asarray(_square(tableau))
 
     def stage(index: Scalar, slopes: jax.Array) -> jax.Array:
-        here = start + jnp.tensordot(weights[index], slopes, 1)
-        slope = increment(jax.tree.unflatten(structure, list(here)))
-        return slopes.at[index].set(jnp.stack(jax.tree.leaves(slope)))
+        row = weights[index]
+        here = sum((row[j] * slopes[j] for j in range(stages - 1)), start=start)
+        return slopes.at[index].set(rows(increment(tree(here))))
 
-    stages = len(tableau.b)
-    slopes_array = lax.fori_loop(0, stages, stage, jnp.zeros((stages, *start.shape)))
-    return jax.tree.unflatten(structure, list(start + jnp.tensordot(final, slopes_array, 1)))
+    slopes_table = lax.fori_loop(0, stages, stage, jnp.zeros((stages, *start.shape)))
+    return tree(sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=start))
 
 
 def _displaced(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Point:
@@ -357,15 +367,15 @@ class Scheme:
             `rk10-circle-rescaled` (15 stages, order 10, by Stepanov), in rescaled time.
         step: the step [s]. Even methods take n = ceil(t/step) steps of t/n each over a motion of length t; the
             rescaled one takes steps of at most `step`, near the bottom 1.9 `step`, much shorter where it flies.
-        written_out: whether all stages of an order-8 step in (theta, p) are written out: slower to compile, faster for
-            many lanes. The circle forms always are.
+        written_out: whether all stages of a step are written out, or run as a loop: slower to compile, faster for many
+            lanes. By default the circle forms are, and order 8 in (theta, p) is not.
     Raises:
         ValueError: an unknown name; a step that is not finite and positive.
     """
 
     name: str
     step: float
-    written_out: bool = False
+    written_out: bool | None = None
 
     def __post_init__(self) -> None:
         if self.name not in METHODS:
@@ -385,6 +395,12 @@ class Scheme:
     @property
     def _circle(self) -> bool:
         return METHODS[self.name].circle
+
+    @property
+    def _rolled(self) -> bool:
+        if self.written_out is None:
+            return not self._circle and len(METHODS[self.name].tableau.b) > _WRITTEN_OUT
+        return not self.written_out
 
     def enter(self, pendulum: Pendulum, state: State) -> Point:
         """The method's own form of a state; `State` itself for methods in (theta, p)."""
@@ -410,10 +426,9 @@ class Scheme:
 
     def move(self, constants: Any, point: Point) -> Point:
         """The point one step later."""
-        tableau = METHODS[self.name].tableau
-        rolled = not self._circle and not self.written_out and len(tableau.b) > _WRITTEN_OUT
         increment = _circle_increment if self._circle else _canonical_increment
-        return explicit_step(tableau, partial(increment, constants), point, written_out=not rolled)
+        tableau = METHODS[self.name].tableau
+        return explicit_step(tableau, partial(increment, constants), point, written_out=not self._rolled)
 
     def move_tangents(self, constants: Any, point: Point, tangents: State) -> tuple[Point, State]:
         """One step of a point together with tangent vectors of it.
@@ -428,15 +443,15 @@ class Scheme:
         Returns:
             The point and the tangents.
         """
-        if jnp.ndim(tangents.theta1) > jnp.ndim(jax.tree.leaves(point)[0]):
-            one = partial(self.move_tangents, constants, point)
-            return jax.vmap(one, out_axes=(None, 0))(tangents)
         if not self._circle:
-            return jax.jvp(partial(self.move, constants), (point,), (tangents,))
+            one = partial(jax.jvp, partial(self.move, constants), (point,))
+            many = jnp.ndim(tangents.theta1) > jnp.ndim(point.theta1)
+            return jax.vmap(lambda d: one((d,)), out_axes=(None, 0))(tangents) if many else one((tangents,))
         rates = constants.per_unit1 * tangents.p1, constants.per_unit2 * tangents.p2
         tangent = _Tangent(tangents.theta1, tangents.theta2, *rates)
         increment = partial(_tangent_increment, constants)
-        point, tangent = explicit_step(METHODS[self.name].tableau, increment, (point, tangent))
+        tableau = METHODS[self.name].tableau
+        point, tangent = explicit_step(tableau, increment, (point, tangent), written_out=not self._rolled)
         return point, State(
             tangent.angle1, tangent.angle2, constants.unit1 * tangent.rate1, constants.unit2 * tangent.rate2
         )

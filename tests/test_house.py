@@ -7,7 +7,7 @@ from pathlib import Path
 
 import dpend
 
-ORDER = """_runtime trig pendulum steppers trajectory events lanes chaos sweeps stability orbits families atlas certify
+ORDER = """_runtime trig pendulum steppers trajectory events lanes chaos sweeps stability shooting orbits families atlas certify
 fit plots animate cli""".split()
 HOUSE = Path(dpend.__file__).parent
 

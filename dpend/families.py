@@ -1,0 +1,861 @@
+"""Families of periodic orbits: curves of releases, from small swings to the motions that take for ever.
+
+`follow_family` walks along one by pseudo-arclength, its orbits cut into segments (see `shooting`), and finds where its
+stability changes, where it turns back and where others branch off; given such a place, it follows the branch.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from dpend._runtime import require_float64
+from dpend.orbits import BRANCHES, PeriodicOrbit
+from dpend.pendulum import Pendulum, Scalar, State, equilibria, hamiltonian, momenta, normal_modes, number
+from dpend.shooting import (
+    CHUNK,
+    METRIC,
+    NEARLY,
+    PARTS,
+    SEGMENTS,
+    SYMMETRIES,
+    UNKNOWNS,
+    Arc,
+    Corrected,
+    Tasks,
+    Walk,
+    hermite,
+    laid,
+    linearised,
+    natural,
+    sensitivities,
+    stability_of,
+    unpacked,
+    walk,
+)
+from dpend.trajectory import Status, known_value
+
+# The first step from a normal mode [rad], where the linear motion is true to 1e-4, and the longest step: a hundred
+# points or so for a family, close enough for cubics to show every turn.
+_FIRST_STEP, _LONGEST_STEP = 0.02, 0.1
+_MOST_POINTS = 5000
+# Resonances k:n are told up to this k.
+_LARGEST_COVER = 6
+
+
+class Slopes(NamedTuple):
+    """Derivatives with respect to arclength: finite at folds too, where those with respect to theta1 are not.
+
+    Attributes:
+        theta1, theta2: of the release.
+        period: [s].
+        energy: [J].
+    """
+
+    theta1: Scalar
+    theta2: Scalar
+    period: Scalar
+    energy: Scalar
+
+
+class _Place(NamedTuple):
+    """A point of a curve, and what it solves."""
+
+    problem: "_Problem"
+    rows: Corrected  # of one row
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SpecialPoint:
+    """A place on a family where something changes.
+
+    Attributes:
+        kind: `stability_lost` or `stability_gained` on the way along the family; `fold_theta1`, `fold_energy`, where
+            the curve turns back in it; `resonance_k:n`, where the multipliers are exp(+-2 pi i n/k) and orbits of k
+            times the period branch off; `crossing`, where another curve runs through this one, or passes it by less
+            than 2e-4.
+        arclength: where, in the family's.
+        orbit: the orbit there.
+        slopes: derivatives with respect to arclength.
+    """
+
+    arclength: Scalar
+    orbit: PeriodicOrbit
+    slopes: Slopes
+    kind: str = field(metadata={"static": True})
+    _place: Any = field(repr=False, metadata={"static": True})
+    _branch: tuple[str, int] | None = field(repr=False, metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Family:
+    """A curve of periodic orbits.
+
+    Attributes:
+        orbits: one `PeriodicOrbit` with a leading axis, in order of arclength; all of one symmetry.
+        arclength: from the family's beginning, shape (n,). ds^2 is the mean of dtheta1^2 + dtheta2^2 over the nodes
+            that cut the arc into segments, plus the square of d log Delta, Delta being the fastest motion's share in a
+            segment: nearly d log(period).
+        slopes: derivatives with respect to arclength, shape (n,).
+        special_points: in order of arclength.
+        status: `Status.CONVERGED` if the family was followed to its ends, `LEFT_BRANCH` if at one no step was short
+            enough, `MAX_ITERATIONS` if it has more points than were allowed.
+        ends: what its beginning and its end are: `normal mode`, `homoclinic` (the period grows without bound as the
+            energy tends to that of an equilibrium with a rod upright), `closed` (it comes back to its beginning),
+            `branch point`, `lost` or `unfinished` (see status).
+    """
+
+    orbits: PeriodicOrbit
+    arclength: Scalar
+    slopes: Slopes
+    special_points: tuple[SpecialPoint, ...]
+    status: Scalar
+    ends: tuple[str, str] = field(metadata={"static": True})
+    _curve: "_Curve" = field(repr=False, metadata={"static": True})
+    _problem: "_Problem" = field(repr=False)
+
+    @property
+    def symmetry(self) -> str:
+        """The symmetry of all its orbits."""
+        return self.orbits.symmetry
+
+    def at(self, theta1: Scalar, *, crossing: int = 1) -> PeriodicOrbit:
+        """The orbits of this family released at `theta1`: Newton's method from where its curve passes.
+
+        An orbit released at (-theta1, -theta2) counts; where the curve has it, the mirror image is returned.
+        Derivatives with respect to `theta1`, and to the pendulum that `follow_family` was given, are those of the root
+        (implicit function theorem): one linear solve and no walk. The walk needs numbers, so that `jax.grad`,
+        `jax.jacfwd` and their like work, and `jax.jit` around it does not.
+
+        Arguments:
+            theta1: release angles of the upper rod [rad], any shape.
+            crossing: which of the curve's passages through `theta1`, in order of arclength.
+        Returns:
+            PeriodicOrbit with leaves of theta1's shape. Where the family does not get there, the status is
+            `NO_SUCH_ORBIT` and the rest NaN.
+        Raises:
+            ValueError: theta1 not finite, or traced by `jit`; a derivative asked for at a fold in theta1, where it is
+                infinite: `slopes` has those with respect to arclength.
+        """
+        return _at(self, theta1, crossing)
+
+
+# --- curves ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """Points of a curve with unit tangents; of a family that begins in a normal mode, the mode itself is the first."""
+
+    points: np.ndarray
+    tangents: np.ndarray
+    steps: np.ndarray
+
+    @property
+    def lengths(self) -> np.ndarray:
+        ways = np.diff(self.points, axis=0)
+        return np.sqrt(np.sum(METRIC * ways**2, axis=1))
+
+    def between(self, index: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Points at shares of the intervals `index`, by cubics."""
+        start, end = self.points[index].T, self.points[index + 1].T
+        slope, end_slope = self.tangents[index].T, self.tangents[index + 1].T
+        return np.asarray(hermite(start, slope, end, end_slope, self.lengths[index], share)).T
+
+    def tangents_between(self, index: np.ndarray, share: np.ndarray) -> np.ndarray:
+        mixed = (1 - share)[:, None] * self.tangents[index] + share[:, None] * self.tangents[index + 1]
+        return mixed / np.sqrt(np.sum(METRIC * mixed**2, axis=1))[:, None]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class _Problem:
+    """What is followed: the pendulum as it was given, which may carry derivatives, and the same in natural units."""
+
+    pendulum: Pendulum
+    natural: Pendulum = field(metadata={"static": True})
+    symmetry: str = field(metadata={"static": True})
+    turns: tuple[float, float] = field(metadata={"static": True})
+
+    @property
+    def arc(self) -> Arc:
+        return Arc(np.asarray(SYMMETRIES.index(self.symmetry)), np.asarray(self.turns))
+
+    def corrected(self, points: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> Corrected:
+        """The points of the family in the planes through `points` that `rows` are normal to."""
+        tables = []
+        for first in range(0, len(points), CHUNK):
+            some = slice(first, first + CHUNK)
+            count = len(points[some])
+            tasks = Tasks(_padded(points[some]), _padded(rows[some]), _padded(steps[some]), np.int64(count))
+            _, table, _, _ = walk(self.natural, _begun(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc)
+            tables.append(np.asarray(table)[:count])
+        return unpacked(np.concatenate(tables))
+
+    def followed(self, start: Walk, origin: Corrected | None, longest: float, most: int) -> tuple[Corrected, str]:
+        """The points after `start`, and what the family's end is; `origin` is the place it could come back to."""
+        nothing = np.zeros((CHUNK, UNKNOWNS))
+        tasks = Tasks(nothing, nothing, nothing[:, 0], np.int64(0))
+        tables: list[np.ndarray] = []
+        count, end = 0, ""
+        while not end and count < most:
+            start, table, more, status = walk(self.natural, start, longest, tasks, self.arc)
+            tables.append(np.asarray(table)[: int(more)])
+            rows, count = unpacked(np.concatenate(tables)), count + int(more)
+            end = ("", "ended", "lost")[int(status)]
+            if end == "lost" and len(rows.point) and self._near_limit(rows):
+                end = "ended"
+            back = None if origin is None else self._back(origin, rows, count - int(more))
+            if back is not None:
+                return _cut(rows, back)
+        if end == "ended":
+            end = "normal mode" if rows.energy[-1] < -0.9 * self.weights else "homoclinic"
+        return _some(rows, slice(most)), end or "unfinished"
+
+    def on_curve(self, point: np.ndarray) -> Corrected | None:
+        """The point of the family near one that is nearly on it, its tangent not known; None if there is none."""
+        row, steps = np.zeros(UNKNOWNS), np.array([_MANY_STEPS])
+        row[[0, 1, -2]] = 0.6, 0.4, 1.0  # crosses any curve but by accident
+        for _ in range(3):
+            rows = self.corrected(point[None], row[None], steps)
+            if not rows.converged[0]:
+                return None
+            point, row, steps = rows.point[0], METRIC * rows.tangent[0], rows.steps
+        return rows
+
+    def onto_branch(self, base: Corrected, point: np.ndarray, sign: float) -> Corrected | None:
+        """The first point of a branch that leaves the family of `base`, from that orbit's own point on this problem;
+        None if nothing is met.
+        """
+        for _ in range(3):  # onto the orbit, by the shortest ways: the equations have rank two less than unknowns here
+            value, jacobian = (np.asarray(x) for x in linearised(self.natural, point, _MANY_STEPS, self.arc))
+            point = point - np.linalg.pinv(jacobian, rcond=_NO_RANK) @ value
+        _, sizes, directions = np.linalg.svd(jacobian)
+        if sizes[-1] > _NO_RANK * sizes[0]:
+            return None
+        kernel = directions[-2:] / np.sqrt(np.sum(METRIC * directions[-2:] ** 2, axis=1))[:, None]
+        old = np.append(base.tangent[0, :4], 0.0)
+        # The family's own direction is the one whose first node moves as the family's does.
+        mix = np.linalg.lstsq(np.column_stack([kernel[:, :4].T]), old[:4], rcond=None)[0]
+        own = mix @ kernel
+        own /= np.sqrt(own @ (METRIC * own))
+        new = kernel[np.argmin(np.abs(kernel @ (METRIC * own)))]
+        new = new - (new @ (METRIC * own)) * own
+        new *= np.sign(new[np.argmax(np.abs(new))]) / np.sqrt(new @ (METRIC * new))
+        new *= sign
+        for size in _ONTO_BRANCH:
+            steps = np.array([_MANY_STEPS])
+            for _ in range(2):
+                rows = self.corrected((point + size * new)[None], (METRIC * new)[None], steps)
+                steps = rows.steps
+            strayed = rows.point[0] - point - size * new
+            if rows.converged[0] and np.sqrt(strayed @ (METRIC * strayed)) < 0.5 * abs(size):
+                return rows
+        return None
+
+    @property
+    def weights(self) -> float:
+        """The largest potential energy, that of the upright pendulum, in natural units."""
+        return float(1 + self.natural.m2 * (1 + self.natural.l2))
+
+    def _near_limit(self, rows: Corrected) -> bool:
+        """Whether a family was lost where rounding, magnified by the inverse distance, keeps it from its end."""
+        levels = np.asarray(equilibria(self.natural).energy)[1:]
+        gap = np.min(np.abs(rows.energy[-1] - levels)) / self.weights
+        return bool(gap < NEARLY and abs(rows.energy_slope[-1]) < 1e3 * NEARLY * self.weights)
+
+    def _back(self, origin: Corrected, rows: Corrected, since: int) -> int | None:
+        """How many points it takes the curve to come back to `origin`, an orbit that it may meet at its other rest."""
+        curve = _curve_of(rows)
+        own = _reduced(origin)[0]
+        other = origin.end[0, :2] if self.symmetry == "brake" else 2 * np.pi * np.asarray(self.turns) - own[:2]
+        where = _reduced(rows)
+        for i in range(max(since - 1, _LEAVING), len(where) - 1):
+            chord = where[i + 1] - where[i]
+            for release in (own, np.append(other, own[2])):
+                apart = _apart(where[i], release)
+                share = apart @ chord / (chord @ chord)
+                near = np.linalg.norm(apart - share * chord) < 0.1 * np.linalg.norm(chord)
+                if -0.1 < share < 1.1 and near and self._meets(curve, i, share, release):
+                    return i + 1
+        return None
+
+    def _meets(self, curve: "_Curve", i: int, share: float, release: np.ndarray) -> bool:
+        """Whether the curve goes through the release, looked at on the curve itself."""
+        for _ in range(4):
+            index, shares = np.array([i]), np.array([share])
+            tangent = curve.tangents_between(index, shares)
+            rows = self.corrected(curve.between(index, shares), METRIC * tangent, curve.steps[index + 1])
+            apart = _apart(_reduced(rows)[0], release)
+            slope = np.append(rows.tangent[0, :2], rows.time_slope[0] / rows.times[0].sum())
+            share += float(apart @ slope / (slope @ slope) / curve.lengths[i])
+        return bool(np.linalg.norm(apart) < _SAME_PLACE)
+
+
+# Points at the beginning that are not looked at for a return; and what counts as one [rad, and log of the time].
+_LEAVING, _SAME_PLACE = 4, 1e-7
+
+
+def _cut(rows: Corrected, count: int) -> tuple[Corrected, str]:
+    """A curve that has come back after `count` points: closed, unless it only turned round at a branch point.
+
+    Where it meets a more symmetric family, a curve goes on through the same orbits, met at their other rests, as often
+    as it took to get there.
+    """
+    rows = _some(rows, slice(count))
+    lengths = np.cumsum(_curve_of(rows).lengths)
+    (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
+    half = [i for i in crossings if abs(lengths[i] - 0.5 * lengths[-1]) < _MIDDLE * lengths[-1]]
+    return (_some(rows, slice(half[0] + 1)), "branch point") if half else (rows, "closed")
+
+
+# How far from the middle of its way a curve may have turned round, as a share of it.
+_MIDDLE = 0.1
+
+
+def _reduced(rows: Corrected) -> np.ndarray:
+    """(theta1, theta2, log of the time), which tell orbits of one symmetry apart."""
+    return np.concatenate([rows.point[:, :2], np.log(rows.times.sum(axis=1))[:, None]], axis=1)
+
+
+def _apart(where: np.ndarray, release: np.ndarray) -> np.ndarray:
+    """From one to the other, angles modulo 2 pi."""
+    way = release - where
+    way[:2] -= 2 * np.pi * np.round(way[:2] / (2 * np.pi))
+    return way
+
+
+def _begun(point: np.ndarray, tangent: np.ndarray, step: float, steps: float) -> Walk:
+    # Always of these types: compiled code is keyed by them.
+    length, size, side = np.array([0.0, step, 0.0])
+    count, leap = np.array([steps, 0]).astype(int)
+    return Walk(point, tangent, point, tangent, length, size, side, count, tangent, leap)
+
+
+def _padded(array: np.ndarray) -> np.ndarray:
+    missing = CHUNK - len(array)
+    return np.concatenate([array, np.repeat(array[:1], missing, axis=0)]).astype(np.float64)
+
+
+def _some(rows: Corrected, which: Any) -> Corrected:
+    return Corrected(*(column[which] for column in rows))
+
+
+def _joined(*parts: Corrected) -> Corrected:
+    return Corrected(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _turned(rows: Corrected) -> Corrected:
+    """The same points, met in the opposite order."""
+    back = _some(rows, slice(None, None, -1))
+    return back._replace(
+        tangent=-back.tangent, time_slope=-back.time_slope, energy_slope=-back.energy_slope, side=-back.side
+    )
+
+
+def _curve_of(rows: Corrected) -> _Curve:
+    return _Curve(rows.point, rows.tangent, rows.steps)
+
+
+# --- from points to orbits -------------------------------------------------------------------------------------------
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _implicit(problem: _Problem, known: Any, parameters: Any, point: Any, row: Any, steps: Any) -> Any:
+    """`known` of orbits, shape (m, 7), as a function of (l2/l1, m2/m1, target), shape (m, 3): see `sensitivities`."""
+    return known
+
+
+@_implicit.defjvp
+def _implicit_jvp(problem, primals, tangents):  # type: ignore[no-untyped-def]
+    turns = jnp.asarray(problem.turns)
+    jacobian = sensitivities(problem.natural, *primals[2:], turns, problem.symmetry)
+    return _implicit(problem, *primals), jnp.einsum("mij,mj->mi", jacobian, tangents[1])
+
+
+def _orbits(problem: _Problem, rows: Corrected, targets: Any = None, along: Any = None) -> PeriodicOrbit:
+    """Points as orbits, in NumPy: eager JAX would compile each operation for each number of points.
+
+    With `targets`, the values of theta1 at which the rows `along` were solved, everything carries derivatives.
+    """
+    _, kappa, logarithm = stability_of(rows.matrices, problem.symmetry)
+    known = np.column_stack([rows.point[:, :4], rows.times.sum(axis=1), kappa, logarithm])
+    pendulum = jax.tree.map(known_value, problem.pendulum)
+    xp: Any = np
+    if targets is not None:
+        pendulum, xp = problem.pendulum, jnp
+        ratios = jnp.stack([pendulum.l2 / pendulum.l1, pendulum.m2 / pendulum.m1])
+        parameters = jnp.column_stack([jnp.broadcast_to(ratios, (len(known), 2)), targets])
+        known = _implicit(problem, known, parameters, rows.point, along, rows.steps)
+    second = xp.sqrt(pendulum.l1 / pendulum.g)
+    momentum = pendulum.m1 * pendulum.l1**2 / second
+    theta1, theta2, p1, p2, time, kappa, logarithm = known.T
+    state = State(theta1, theta2, momentum * p1, momentum * p2)
+    turns = np.asarray(problem.turns)
+    dual = State(2 * np.pi * turns[0] - theta1, 2 * np.pi * turns[1] - theta2, -state.p1, -state.p2)
+    if problem.symmetry == "brake":
+        dual = State(rows.end[:, 0], rows.end[:, 1], dual.p1, dual.p2)
+    whole = (turns if problem.symmetry == "centred" else 0 * turns).astype(int)
+    period = PARTS[problem.symmetry] * second * time
+    one = np.ones(len(rows.point))
+    orbit = PeriodicOrbit(
+        pendulum=jax.tree.map(lambda leaf: leaf * one, pendulum),
+        state=state,
+        period=period,
+        energy=pendulum.m1 * pendulum.g * pendulum.l1 * rows.energy if xp is np else hamiltonian(pendulum, state),
+        residual=rows.residual,
+        iterations=rows.iterations.astype(int),
+        kappa=kappa,
+        log_abs_kappa=logarithm,
+        dual=dual,
+        turns=(whole[0] * one.astype(int), whole[1] * one.astype(int)),
+        error_estimate=(rows.angle_error, rows.time_error * np.asarray(lax.stop_gradient(period))),
+        status=np.where(rows.converged > 0, int(Status.CONVERGED), int(Status.MAX_ITERATIONS)),
+        symmetry=problem.symmetry,
+    )
+    return orbit
+
+
+def _slopes(problem: _Problem, rows: Corrected) -> Slopes:
+    pendulum = jax.tree.map(known_value, problem.pendulum)
+    second = math.sqrt(pendulum.l1 / pendulum.g)
+    return Slopes(
+        rows.tangent[:, 0],
+        rows.tangent[:, 1],
+        PARTS[problem.symmetry] * second * rows.time_slope,
+        pendulum.m1 * pendulum.g * pendulum.l1 * rows.energy_slope,
+    )
+
+
+# The derivative with respect to theta1 is refused where less than this of a step along the curve goes into it.
+_AT_FOLD = 1e-6
+# Each interval is looked at in this many pieces for passages through an angle.
+_PIECES = 8
+
+
+def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
+    """See `Family.at`."""
+    if not isinstance(crossing, int) or crossing < 1:
+        raise ValueError(f"crossing must be an integer of at least 1, got {crossing!r}")
+    try:
+        wanted = np.asarray(lax.stop_gradient(theta1), np.float64)
+    except jax.errors.TracerArrayConversionError:
+        raise ValueError("theta1 must be a number here, not traced by jit: use find_orbit inside jit") from None
+    if not np.all(np.isfinite(wanted)):
+        raise ValueError(f"theta1 must be finite [rad], got {wanted}: give other angles")
+    problem, curve = family._problem, family._curve
+    targets = np.abs(wanted.ravel())
+    index, share = _passages(curve, targets, crossing)
+    found = index >= 0
+    points = curve.between(np.maximum(index, 0), share)
+    mirrored = (points[:, 0] < 0) != (wanted.ravel() < 0)
+    sides = np.where(points[:, 0] < 0, -1.0, 1.0)
+    points[:, 0] = sides * targets
+    rows = np.zeros_like(points)
+    rows[:, 0] = 1.0
+    solved = problem.corrected(points, rows, curve.steps[np.maximum(index, 0) + 1])
+    away = np.sqrt(np.sum(METRIC * (solved.point - points) ** 2, axis=1))
+    strayed = away > np.maximum(_STRAYED * curve.lengths[np.maximum(index, 0)], 1e-9)
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((theta1, problem.pendulum)))
+    slope = np.abs(solved.tangent[:, 0])
+    if traced and np.any(found & (slope < _AT_FOLD)):
+        angle = wanted.ravel()[np.argmax(found & (slope < _AT_FOLD))]
+        raise ValueError(
+            f"theta1 must not be a fold of the family for a derivative, got {angle}: it is infinite there; the "
+            "family's slopes are derivatives with respect to arclength"
+        )
+    along = jnp.ravel(jnp.asarray(theta1)) * np.where(mirrored, -1.0, 1.0) if traced else None
+    orbits = _orbits(problem, solved, along, rows)
+    status = np.where(strayed & (orbits.status == Status.CONVERGED), Status.LEFT_BRANCH, orbits.status)
+    status = np.where(found, status, Status.NO_SUCH_ORBIT)
+    orbits = replace(_mirrored(orbits, mirrored), status=status)
+
+    def shaped(leaf: Any) -> Any:
+        xp = np if isinstance(leaf, np.ndarray) else jnp
+        leaf = xp.where(found, leaf, np.nan) if np.issubdtype(leaf.dtype, np.floating) else leaf
+        return jnp.asarray(xp.reshape(leaf, wanted.shape))
+
+    return jax.tree.map(shaped, orbits)
+
+
+# The cubic is true to a few thousandths of its interval: a root further away than this share of it is another orbit.
+_STRAYED = 0.1
+
+
+def _passages(curve: _Curve, targets: np.ndarray, crossing: int) -> tuple[np.ndarray, np.ndarray]:
+    """The interval (-1 where there is none) and the share of it at which |theta1| meets each target."""
+    pieces = np.arange(_PIECES) / _PIECES
+    index = np.repeat(np.arange(len(curve.points) - 1), _PIECES)
+    shares = np.tile(pieces, len(curve.points) - 1)
+    seen = np.append(np.abs(curve.between(index, shares)[:, 0]), np.abs(curve.points[-1, 0]))
+    below = seen[None, :] < targets[:, None]
+    passed = np.cumsum(below[:, 1:] != below[:, :-1], axis=1)
+    piece = np.argmax(passed >= crossing, axis=1)
+    found = passed[:, -1] >= crossing
+    low, high = shares[piece], shares[piece] + 1 / _PIECES
+    starts_below = below[np.arange(len(targets)), piece]
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        same = (np.abs(curve.between(index[piece], middle)[:, 0]) < targets) == starts_below
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return np.where(found, index[piece], -1), 0.5 * (low + high)
+
+
+def _mirrored(orbits: PeriodicOrbit, which: np.ndarray) -> PeriodicOrbit:
+    """The mirror image x -> -x of some of the orbits."""
+    sign = np.where(which, -1, 1)
+    state, dual = (jax.tree.map(lambda leaf: sign * leaf, x) for x in (orbits.state, orbits.dual))
+    return replace(orbits, state=state, dual=dual, turns=(sign * orbits.turns[0], sign * orbits.turns[1]))
+
+
+# --- special points --------------------------------------------------------------------------------------------------
+
+
+class _Test(NamedTuple):
+    """A function of the points that vanishes where something changes."""
+
+    kind: str
+    value: Callable[[Corrected, np.ndarray], np.ndarray]
+    branch: tuple[str, int] | None  # symmetry of the orbits that branch off, and their period in units of this one's
+
+
+def _tests(symmetry: str) -> list[_Test]:
+    """What is looked for; the second argument of a test is c, of brake orbits kappa."""
+    tests = [
+        _Test("fold_theta1", lambda rows, c: rows.tangent[:, 0], None),
+        _Test("fold_energy", lambda rows, c: rows.energy_slope, None),
+    ]
+    branches = {"centred": (("odd", 1), ("brake", 1)), "brake": (None, ("brake", 2)), "odd": (None, None)}[symmetry]
+    tests.append(_Test("above", lambda rows, c: c - 1, branches[0]))
+    tests.append(_Test("below", lambda rows, c: c + 1, branches[1]))
+    for k in range(2, _LARGEST_COVER + 1):
+        for n in range(1, k):
+            if math.gcd(n, k) > 1 or (symmetry == "brake" and 2 * n > k):
+                continue
+            target = math.cos((2 if symmetry == "brake" else 1) * math.pi * n / k)
+            branch = "centred" if symmetry == "centred" and n % 2 == 0 else "brake"
+            value = partial(lambda target, rows, c: c - target, target)
+            tests.append(_Test(f"resonance_{k}:{n}", value, (branch, k) if symmetry != "odd" else None))
+    return tests
+
+
+def _measure(rows: Corrected, symmetry: str) -> np.ndarray:
+    """What the tests are told: c, or kappa of brake orbits."""
+    c, kappa, _ = stability_of(rows.matrices, symmetry)
+    return np.asarray(kappa if symmetry == "brake" else c)
+
+
+# A special point is located when the step is below this [arclength], and real if its equation is then met so well.
+_LOCATED, _MET = 1e-12, 1e-6
+_ROUNDS = 60
+
+
+def _special_points(problem: _Problem, rows: Corrected, curve: _Curve, arclength: np.ndarray) -> list[SpecialPoint]:
+    """Every place between two points where a test changes sign.
+
+    Located by Newton's method on the family's equations together with the test's: each point is corrected onto the
+    curve, and the step along it is the secant's, kept inside its bracket (Illinois).
+    """
+    offset = len(curve.points) - len(rows.point)
+    measure, tests = _measure(rows, problem.symmetry), _tests(problem.symmetry)
+    found = []
+    for test in tests:
+        values = test.value(rows, measure)
+        (changes,) = np.nonzero((values[:-1] < 0) != (values[1:] < 0))
+        found += [(test, i, values[i], values[i + 1]) for i in changes]
+    crossings = np.flatnonzero(rows.side[:-1] != rows.side[1:])
+    points = []
+    if found:
+        index = np.array([i for _, i, _, _ in found]) + offset
+        shares, located, values = _roots(problem, curve, found, index)
+        for j, (test, _, before, _) in enumerate(found):
+            if abs(values[j]) > _MET:
+                continue  # c changes from one huge value to another in less than a step can resolve
+            place = _some(located, slice(j, j + 1))
+            kind = test.kind
+            if kind in ("above", "below"):  # the bound of the stable range: is it left?
+                kind = "stability_lost" if (before < 0) == (kind == "above") else "stability_gained"
+            where = arclength[index[j]] + shares[j] * (arclength[index[j] + 1] - arclength[index[j]])
+            branch = test.branch
+            points.append(_special(problem, place, where, kind, branch))
+    for i in crossings:
+        points.append(_special(problem, _some(rows, slice(i, i + 1)), arclength[i + offset], "crossing", None))
+    return sorted(points, key=lambda point: float(point.arclength))
+
+
+def _special(problem: _Problem, place: Corrected, where: float, kind: str, branch: Any) -> SpecialPoint:
+    both = _orbits(problem, place), _slopes(problem, place)
+    orbit, slopes = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), both)
+    return SpecialPoint(jnp.asarray(where), orbit, slopes, kind, _Place(problem, place), branch)
+
+
+def _roots(problem: _Problem, curve: _Curve, found: list, index: np.ndarray) -> tuple:
+    """Shares of the intervals `index` at which the tests vanish, the rows there, and the tests' values."""
+    low, high = np.zeros(len(found)), np.ones(len(found))
+    at_low, at_high = (np.array([entry[k] for entry in found]) for k in (2, 3))
+    positive = at_low > 0
+    lengths = curve.lengths[index]
+    share, last = np.full(len(found), np.inf), np.zeros(len(found))
+    for _ in range(_ROUNDS):
+        with np.errstate(invalid="ignore", over="ignore"):
+            secant = (low * at_high - high * at_low) / (at_high - at_low)
+        inside = np.isfinite(secant) & (secant > low) & (secant < high)
+        secant = np.where(inside, secant, 0.5 * (low + high))
+        step, share = np.abs(secant - share) * lengths, secant
+        tangents = curve.tangents_between(index, share)
+        rows = problem.corrected(curve.between(index, share), METRIC * tangents, curve.steps[index + 1])
+        measure = _measure(rows, problem.symmetry)
+        each = (entry[0].value(_some(rows, slice(j, j + 1)), measure[j : j + 1])[0] for j, entry in enumerate(found))
+        value = np.fromiter(each, np.float64, len(found))
+        if np.all((step < _LOCATED) | (value == 0)):
+            break
+        before = (value > 0) == positive
+        # The weight of an end that stays for a second time is halved.
+        at_high = np.where(before, np.where(last < 0, 0.5 * at_high, at_high), value)
+        at_low = np.where(before, value, np.where(last > 0, 0.5 * at_low, at_low))
+        low, high, last = np.where(before, share, low), np.where(before, high, share), np.where(before, -1, 1)
+    return share, rows, value
+
+
+# --- where families begin --------------------------------------------------------------------------------------------
+
+
+def follow_family(
+    pendulum: Pendulum,
+    start: "str | PeriodicOrbit | SpecialPoint",
+    *,
+    longest_step: float = _LONGEST_STEP,
+    most_points: int = _MOST_POINTS,
+) -> Family:
+    """The family of periodic orbits that `start` belongs to, from end to end.
+
+    Pseudo-arclength continuation of orbits by multiple shooting, folds passed: a step is taken back if Newton's method
+    contracts slowly, the tangent turns by more than 18 degrees, or the bordered Jacobian's determinant changes sign,
+    which would be a jump to another curve. The family ends where the energy comes within 1e-8 of that of an equilibrium
+    with a rod upright (in units of the weights' torques; the period then grows like its logarithm), where it is back at
+    its beginning, or at the hanging pendulum.
+
+    Arguments:
+        pendulum: the derivatives of its leaves, if they carry any, reach what `Family.at` returns; `jit` around this
+            does not work.
+        start: `in-phase` or `anti-phase`, the family of a normal mode; or an orbit, from which its family is followed
+            in both directions; or a special point, for the branch that leaves there: at a loss or gain of stability of
+            centred orbits with c = 1 the orbits with x(T/2) = -x(0) that are no longer released from rest, with c = -1
+            those released from rest that are no longer centred, at a resonance the brake orbits of k times the period.
+        longest_step: in arclength; the default gives about a hundred points.
+        most_points: on one side of the start.
+    Raises:
+        ValueError: an unknown name; g not positive; an orbit of another pendulum, or that has not converged; a special
+            point where nothing branches off.
+        RuntimeError: float64 is switched off in JAX.
+    See also: Doedel, Keller and Kernevez, Numerical analysis and control of bifurcation problems (1991); Peeters et
+        al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
+    """
+    require_float64()
+    fixed = _known(pendulum)
+    longest = np.float64(number("longest_step", longest_step, positive=True))
+    if not isinstance(most_points, int) or most_points < 2:
+        raise ValueError(f"most_points must be an integer of at least 2, got {most_points!r}")
+    scaled = jax.tree.map(np.asarray, natural(fixed))
+    if isinstance(start, str):
+        if start not in BRANCHES:
+            raise ValueError(f"start must be one of {', '.join(BRANCHES)}, or an orbit, got {start!r}")
+        return _from_mode(_Problem(pendulum, scaled, "centred", (0.0, 0.0)), start, longest, most_points)
+    if isinstance(start, SpecialPoint):
+        return _from_branch_point(pendulum, start, longest, most_points)
+    return _from_orbit(pendulum, scaled, start, longest, most_points)
+
+
+def _known(pendulum: Pendulum) -> Pendulum:
+    values = {}
+    for name, leaf in vars(pendulum).items():
+        value = known_value(leaf)
+        if value is None:
+            raise ValueError(f"{name} must be a number here, not traced by jit: use find_orbit inside jit")
+        values[name] = value
+    if not values["g"] > 0:
+        raise ValueError(f"g must be positive for a family, got {values['g']:g}: nothing swings back without gravity")
+    return Pendulum(**values)
+
+
+def _from_mode(problem: _Problem, branch: str, longest: float, most: int) -> Family:
+    slow, fast = normal_modes(problem.natural)
+    mode = slow if branch == "in-phase" else fast
+    frequency, ratio = float(mode.frequency), float(mode.ratio)
+    phase = 0.5 * np.pi * np.arange(SEGMENTS) / SEGMENTS
+    moving = momenta(problem.natural, 0.0, 0.0, frequency, frequency * ratio)  # at the bottom
+    shape = [np.cos(phase), ratio * np.cos(phase), -moving.p1 * np.sin(phase), -moving.p2 * np.sin(phase)]
+    tangent = np.append(np.stack(shape, axis=1).ravel(), [0.0, 0.0])
+    tangent /= np.sqrt(tangent @ (METRIC * tangent))
+    # At the bottom the fastest rate is that of the fast mode.
+    delta = 0.5 * np.pi / frequency * float(fast.frequency) / SEGMENTS
+    origin = np.append(np.zeros(UNKNOWNS - 2), [math.log(delta), 0.0])
+    rows, end = problem.followed(_begun(origin, tangent, _FIRST_STEP, 4), None, longest, most)
+    curve = _curve_of(rows)
+    points, tangents = np.vstack([origin, curve.points]), np.vstack([tangent, curve.tangents])
+    curve = _Curve(points, tangents, np.append(4, curve.steps))
+    return _family(problem, rows, curve, ("normal mode", end))
+
+
+def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, longest: float, most: int) -> Family:
+    fixed = _known(pendulum)
+    mine = [float(leaf) for leaf in jax.tree.leaves(orbit.pendulum)]
+    if np.shape(orbit.period):
+        raise ValueError(
+            f"start must be a single orbit, got one with shape {np.shape(orbit.period)}: choose one of them"
+        )
+    if not np.allclose(mine, jax.tree.leaves(fixed), rtol=1e-12):
+        raise ValueError(f"start must be an orbit of this pendulum, got one of {orbit.pendulum}")
+    if int(orbit.status) != Status.CONVERGED:
+        raise ValueError(f"start must have converged, got status {Status(int(orbit.status)).name.lower()}")
+    second = math.sqrt(fixed.l1 / fixed.g)
+    momentum = fixed.m1 * fixed.l1**2 / second
+    state, dual = (
+        np.array([x.theta1, x.theta2, x.p1 / momentum, x.p2 / momentum], np.float64) for x in (orbit.state, orbit.dual)
+    )
+    turns = {"centred": np.array(orbit.turns, np.float64), "odd": np.round((state + dual)[:2] / (2 * np.pi))}
+    symmetry = orbit.symmetry
+    full = turns.get(symmetry, np.zeros(2))
+    problem = _Problem(pendulum, scaled, symmetry, (float(full[0]), float(full[1])))
+    duration = float(orbit.period) / second / PARTS[symmetry]
+    point = _laid_out(problem, np.zeros(1), state[None], duration)
+    rows = problem.on_curve(point)
+    if rows is None or np.linalg.norm(_apart(rows.point[0, :2], state[:2])) > _SAME_ORBIT:
+        raise ValueError("start must be an orbit whose motion is still known at the end of its arc: give another one")
+    return _both_ways(problem, rows, longest, most)
+
+
+# How far the corrected start may be from the orbit that was given [rad].
+_SAME_ORBIT = 1e-5
+
+
+def _both_ways(problem: _Problem, rows: Corrected, longest: float, most: int) -> Family:
+    """The family through a point, in both directions unless it is closed."""
+    first = min(_FIRST_STEP, longest)
+    start = _begun(rows.point[0], rows.tangent[0], first, rows.steps[0])
+    ahead, end = problem.followed(start, rows, longest, most)
+    if end == "closed":
+        return _closed(problem, rows, ahead)
+    behind, begin = problem.followed(start._replace(tangent=-start.tangent), rows, longest, most)
+    rows = _joined(_turned(behind), rows, ahead)
+    return _family(problem, rows, _curve_of(rows), (begin, end))
+
+
+def _closed(problem: _Problem, start: Corrected, ahead: Corrected) -> Family:
+    """A curve that comes back to its beginning: to the same rest, which is then its last point too, or to the other."""
+    rows = _joined(start, ahead)
+    gap = np.sqrt(np.sum(METRIC * (ahead.point[-1] - start.point[0]) ** 2))
+    if gap < 2 * _curve_of(rows).lengths[-1]:
+        rows = _joined(rows, start)
+    return _family(problem, rows, _curve_of(rows), ("closed", "closed"))
+
+
+def _family(problem: _Problem, rows: Corrected, curve: _Curve, ends: tuple[str, str]) -> Family:
+    arclength = np.concatenate([[0.0], np.cumsum(curve.lengths)])
+    points = _special_points(problem, rows, curve, arclength)
+    status = Status.CONVERGED
+    if "unfinished" in ends:
+        status = Status.MAX_ITERATIONS
+    if "lost" in ends:
+        status = Status.LEFT_BRANCH
+    return Family(
+        orbits=jax.tree.map(jnp.asarray, _orbits(problem, rows)),
+        arclength=jnp.asarray(arclength[len(arclength) - len(rows.point) :]),
+        slopes=jax.tree.map(jnp.asarray, _slopes(problem, rows)),
+        special_points=tuple(points),
+        status=jnp.asarray(int(status)),
+        ends=ends,
+        _curve=curve,
+        _problem=problem,
+    )
+
+
+def _laid_out(problem: _Problem, times: np.ndarray, states: np.ndarray, duration: float) -> np.ndarray:
+    """A point to be corrected for an arc of `duration` on an orbit of which some states are known."""
+    missing = _KNOWN - len(times)
+    times = np.append(times, np.full(missing, np.inf))
+    states = np.vstack([states, np.zeros((missing, 4))])
+    return np.asarray(laid(problem.natural, times, states, duration))
+
+
+# Room for the known states of six periods of a centred orbit, so that the laying of arcs compiles once.
+_KNOWN = 4 * SEGMENTS * _LARGEST_COVER
+
+
+def _unrolled(place: _Place) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states known on half a period of an orbit: its nodes and, if it is centred, their images about T/4."""
+    rows, problem = place.rows, place.problem
+    states = rows.point[0, : 4 * SEGMENTS].reshape(SEGMENTS, 4)
+    times = np.concatenate([[0.0], np.cumsum(rows.times[0])])
+    if problem.symmetry != "centred":
+        return times[:-1], states
+    images = states[:0:-1] * [-1, -1, 1, 1] + 2 * np.pi * np.append(problem.turns, [0, 0])
+    centre = rows.end[0]
+    return np.append(times, 2 * times[-1] - times[-2:0:-1]), np.vstack([states, centre, images])
+
+
+def _repeated(place: _Place, halves: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same on so many halves of the period."""
+    times, states = _unrolled(place)
+    half = place.rows.times[0].sum() * PARTS[place.problem.symmetry] / 2
+    all_times, all_states = [times], [states]
+    for i in range(1, halves):
+        if place.problem.symmetry == "brake":
+            # Each rest reflects time: the second half is the first, backwards, with the momenta turned round.
+            back = np.append(half, times[:0:-1]), np.vstack([place.rows.end[0], states[:0:-1]]) * [1, 1, -1, -1]
+            later = (half - back[0], back[1]) if i % 2 else (times, states)
+        else:
+            turned = 2 * np.pi * np.append(place.problem.turns, [0, 0]) - states
+            later = (times, turned if i % 2 else states)
+        all_times.append(i * half + later[0])
+        all_states.append(later[1])
+    return np.concatenate(all_times), np.concatenate(all_states)
+
+
+# Steps in a segment where none were counted yet.
+_MANY_STEPS = 40
+# Singular values below this share of the largest are zero.
+_NO_RANK = 1e-3
+# How far along the new direction the branch is looked for.
+_ONTO_BRANCH = (0.02, 0.005, 0.05, 0.001)
+
+
+def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: float, most: int) -> Family:
+    if special._branch is None:
+        raise ValueError(f"start must be a point where a family branches off, got {special.kind}: follow its orbit")
+    symmetry, k = special._branch
+    base = special._place
+    if special.kind.startswith("stability") and abs(float(base.rows.energy_slope[0])) < _AT_FOLD:
+        raise ValueError(f"start must be a point where a family branches off, got {special.kind} at a fold in energy")
+    half = float(base.rows.times[0].sum()) * PARTS[base.problem.symmetry] / 2
+    duration = k * half * 2 / PARTS[symmetry]
+    turns = base.problem.turns if symmetry != "brake" else (0.0, 0.0)
+    problem = _Problem(pendulum, base.problem.natural, symmetry, turns)
+    point = _laid_out(problem, *_repeated(base, k), duration)
+    sides = []
+    for sign in (1.0, -1.0):
+        rows = problem.onto_branch(base.rows, point, sign)
+        if rows is None:
+            raise ValueError(
+                f"start must be a point where a family branches off, got {special.kind} without one nearby"
+            )
+        start = _begun(rows.point[0], rows.tangent[0], min(_FIRST_STEP, longest), rows.steps[0])
+        ahead, end = problem.followed(start, rows, longest, most)
+        if end == "closed":
+            return _closed(problem, rows, ahead)
+        sides.append((_joined(rows, ahead), end))
+        if symmetry != "centred":
+            break  # the other side holds the same orbits, at their other rest or in the mirror
+    (one, end), other = sides[0], sides[1:]
+    if other:
+        rows = _joined(_turned(other[0][0]), one)
+        return _family(problem, rows, _curve_of(rows), (other[0][1], end))
+    return _family(problem, one, _curve_of(one), ("branch point", end))
