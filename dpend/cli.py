@@ -119,6 +119,37 @@ def orbit(
 
 
 @app.command()
+def family(
+    branch: Annotated[str, typer.Option(help="in-phase (slow mode) or anti-phase (fast mode).")],
+    out: Annotated[
+        Path | None, typer.Option(help="Write all points to F.csv, or to F.json what --json prints.")
+    ] = None,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """All orbits of a normal mode, from small swings to the upright pendulum, and where their stability changes."""
+    if branch not in BRANCHES:
+        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    formats = {".csv": _write_family_csv, ".json": _write_json}
+    if out is not None:
+        check_place("out", out, tuple(formats))
+    found = dpend.follow_family(Pendulum(l1, l2, m1, m2, g), branch)
+    record = _family_record(found, branch)
+    if out is not None:
+        with replacing(out) as draft:
+            formats[out.suffix](record, draft)
+    if as_json:
+        _print_json(record)
+    else:
+        _print_family(found, record, out)
+    return 0 if int(found.status) == Status.CONVERGED else 1
+
+
+@app.command()
 def simulate(
     theta1: _Theta1,
     theta2: Annotated[float, _numeric(help="Release angle of the lower rod [deg].")],
@@ -366,6 +397,42 @@ def _orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
     }
 
 
+def _family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
+    orbits, status = family.orbits, Status(int(family.status))
+    columns = {
+        "arclength": family.arclength,
+        "theta1_deg": np.degrees(orbits.theta1),
+        "theta2_deg": np.degrees(orbits.theta2),
+        "period_s": orbits.period,
+        "energy_J": orbits.energy,
+        "kappa": orbits.kappa,
+        "log_abs_kappa": orbits.log_abs_kappa,
+        "theta2_error_deg": np.degrees(orbits.error_estimate[0]),
+        "period_error_s": orbits.error_estimate[1],
+    }
+    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
+    return {
+        "branch": branch,
+        "points": [dict(zip(columns, row, strict=True)) | {"symmetry": family.symmetry} for row in rows],
+        "bifurcations": [
+            {
+                "kind": point.kind,
+                "arclength": float(point.arclength),
+                "theta1_deg": _degrees(point.orbit.theta1),
+                "theta2_deg": _degrees(point.orbit.theta2),
+                "period_s": float(point.orbit.period),
+                "energy_J": float(point.orbit.energy),
+                "kappa": float(point.orbit.kappa),
+            }
+            for point in family.special_points
+        ],
+        "ends": list(family.ends),
+        "status": status.name.lower(),
+        "message": family.message,
+        "pendulum": _pendulum_record(Pendulum(*(leaf[0] for leaf in jax.tree.leaves(orbits.pendulum)))),
+    }
+
+
 def _pendulum_record(pendulum: Pendulum) -> dict[str, float]:
     names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
     return {key: float(getattr(pendulum, name)) for name, key in names.items()}
@@ -396,7 +463,9 @@ def _degrees(radians: Any) -> float:
     return math.degrees(float(radians))
 
 
-def _print_json(record: dict[str, Any]) -> None:
+def _as_json(record: dict[str, Any]) -> str:
+    """NaN and infinity become null."""
+
     def clean(value: Any) -> Any:
         if isinstance(value, dict):
             return {key: clean(item) for key, item in value.items()}
@@ -404,7 +473,11 @@ def _print_json(record: dict[str, Any]) -> None:
             return [clean(item) for item in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    print(json.dumps(clean(record), indent=2, allow_nan=False))
+    return json.dumps(clean(record), indent=2, allow_nan=False)
+
+
+def _print_json(record: dict[str, Any]) -> None:
+    print(_as_json(record))
 
 
 def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
@@ -432,6 +505,45 @@ def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) ->
     Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
     for failure in failures:
         print(failure)
+
+
+# Rows of the table that stand for a family.
+_SHOWN_POINTS = 12
+
+
+def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    pendulum = Pendulum(*record["pendulum"].values())
+    table = Table(title=_described(pendulum), title_justify="left", title_style="")
+    headings = ("theta1 (deg)", "theta2 (deg)", "period (s)", "energy (J)", "stability", "log |kappa|", "")
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
+    points = record["points"]
+    chosen = np.unique(np.linspace(0, len(points) - 1, _SHOWN_POINTS).round().astype(int))
+    rows = [points[i] | {"kind": ""} for i in chosen]
+    for special in record["bifurcations"]:
+        logarithm = math.log(max(abs(special["kappa"]), sys.float_info.min))
+        rows.append(special | {"log_abs_kappa": logarithm})
+    for row in sorted(rows, key=lambda row: row["arclength"]):
+        marginal = row["kind"].startswith("stability")
+        table.add_row(
+            f"{row['theta1_deg']:.9f}",
+            f"{row['theta2_deg']:.9f}",
+            f"{row['period_s']:.10f}",
+            f"{row['energy_J']:.9f}",
+            "" if marginal else dpend.stability_class(row["kappa"]),
+            "0" if marginal else f"{row['log_abs_kappa']:.5g}",
+            row["kind"],
+        )
+    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    worst = max(point["theta2_error_deg"] for point in points)
+    print(f"{len(points)} orbits from {family.ends[0]} to {family.ends[1]}; error of theta2 at most {worst:.0e} deg")
+    if int(family.status) != Status.CONVERGED:
+        print(f"{record['status']}: {record['message']}")
+    if out is not None:
+        print(f"written to {out}")
 
 
 def _described(pendulum: Pendulum) -> str:
@@ -474,6 +586,17 @@ def _write_csv(motion: Trajectory, path: Path) -> None:
         rows = csv.writer(file)
         rows.writerow(["time_s", "theta1_deg", "theta2_deg", "p1_kg_m2_s", "p2_kg_m2_s"])
         rows.writerows(zip(*(np.asarray(column).tolist() for column in columns), strict=True))
+
+
+def _write_family_csv(record: dict[str, Any], path: Path) -> None:
+    with path.open("w", newline="") as file:
+        rows = csv.DictWriter(file, record["points"][0])
+        rows.writeheader()
+        rows.writerows(record["points"])
+
+
+def _write_json(record: dict[str, Any], path: Path) -> None:
+    path.write_text(_as_json(record) + "\n")
 
 
 def _write_netcdf(motion: Trajectory, path: Path) -> None:

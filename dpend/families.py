@@ -17,9 +17,10 @@ from jax import lax
 
 from dpend._runtime import require_float64
 from dpend.orbits import BRANCHES, PeriodicOrbit
-from dpend.pendulum import Pendulum, Scalar, State, equilibria, hamiltonian, momenta, normal_modes, number
+from dpend.pendulum import Pendulum, Scalar, State, equilibria, hamiltonian, number
 from dpend.shooting import (
     CHUNK,
+    FIRST_STEP,
     METRIC,
     NEARLY,
     PARTS,
@@ -30,6 +31,7 @@ from dpend.shooting import (
     Corrected,
     Tasks,
     Walk,
+    beginning,
     hermite,
     laid,
     linearised,
@@ -41,9 +43,8 @@ from dpend.shooting import (
 )
 from dpend.trajectory import Status, known_value
 
-# The first step from a normal mode [rad], where the linear motion is true to 1e-4, and the longest step: a hundred
-# points or so for a family, close enough for cubics to show every turn.
-_FIRST_STEP, _LONGEST_STEP = 0.02, 0.1
+# The longest step: a hundred points or so for a family, close enough for cubics to show every turn.
+_LONGEST_STEP = 0.1
 _MOST_POINTS = 5000
 # Resonances k:n are told up to this k.
 _LARGEST_COVER = 6
@@ -127,6 +128,11 @@ class Family:
         """The symmetry of all its orbits."""
         return self.orbits.symmetry
 
+    @property
+    def message(self) -> str:
+        """The sentence that says what its status means."""
+        return _MESSAGES[Status(int(self.status))]
+
     def at(self, theta1: Scalar, *, crossing: int = 1) -> PeriodicOrbit:
         """The orbits of this family released at `theta1`: Newton's method from where its curve passes.
 
@@ -146,6 +152,14 @@ class Family:
                 infinite: `slopes` has those with respect to arclength.
         """
         return _at(self, theta1, crossing)
+
+
+_MESSAGES = {
+    Status.CONVERGED: "Followed from end to end.",
+    Status.LEFT_BRANCH: "At one end no step was short enough to stay on this curve: its orbits are as they are, but it "
+    "goes on.",
+    Status.MAX_ITERATIONS: "It has more points than were allowed: raise most_points.",
+}
 
 
 # --- curves ----------------------------------------------------------------------------------------------------------
@@ -195,15 +209,15 @@ class _Problem:
         for first in range(0, len(points), CHUNK):
             some = slice(first, first + CHUNK)
             count = len(points[some])
-            tasks = Tasks(_padded(points[some]), _padded(rows[some]), _padded(steps[some]), np.int64(count))
+            tasks = Tasks(_padded(points[some]), _padded(rows[some]), _padded(steps[some]).astype(int), np.int64(count))
             _, table, _, _ = walk(self.natural, _begun(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc)
             tables.append(np.asarray(table)[:count])
         return unpacked(np.concatenate(tables))
 
-    def followed(self, start: Walk, origin: Corrected | None, longest: float, most: int) -> tuple[Corrected, str]:
+    def followed(self, start: Walk, origin: Corrected | None, longest: Scalar, most: int) -> tuple[Corrected, str]:
         """The points after `start`, and what the family's end is; `origin` is the place it could come back to."""
         nothing = np.zeros((CHUNK, UNKNOWNS))
-        tasks = Tasks(nothing, nothing, nothing[:, 0], np.int64(0))
+        tasks = Tasks(nothing, nothing, nothing[:, 0].astype(int), np.int64(0))
         tables: list[np.ndarray] = []
         count, end = 0, ""
         while not end and count < most:
@@ -216,9 +230,11 @@ class _Problem:
             back = None if origin is None else self._back(origin, rows, count - int(more))
             if back is not None:
                 return _cut(rows, back)
+        if count > most:
+            return _some(rows, slice(most)), "unfinished"
         if end == "ended":
             end = "normal mode" if rows.energy[-1] < -0.9 * self.weights else "homoclinic"
-        return _some(rows, slice(most)), end or "unfinished"
+        return rows, end or "unfinished"
 
     def on_curve(self, point: np.ndarray) -> Corrected | None:
         """The point of the family near one that is nearly on it, its tangent not known; None if there is none."""
@@ -333,7 +349,7 @@ def _apart(where: np.ndarray, release: np.ndarray) -> np.ndarray:
     return way
 
 
-def _begun(point: np.ndarray, tangent: np.ndarray, step: float, steps: float) -> Walk:
+def _begun(point: np.ndarray, tangent: np.ndarray, step: Scalar, steps: Scalar) -> Walk:
     # Always of these types: compiled code is keyed by them.
     length, size, side = np.array([0.0, step, 0.0])
     count, leap = np.array([steps, 0]).astype(int)
@@ -342,7 +358,7 @@ def _begun(point: np.ndarray, tangent: np.ndarray, step: float, steps: float) ->
 
 def _padded(array: np.ndarray) -> np.ndarray:
     missing = CHUNK - len(array)
-    return np.concatenate([array, np.repeat(array[:1], missing, axis=0)]).astype(np.float64)
+    return np.concatenate([array, np.repeat(array[:1], missing, axis=0)])
 
 
 def _some(rows: Corrected, which: Any) -> Corrected:
@@ -368,17 +384,70 @@ def _curve_of(rows: Corrected) -> _Curve:
 # --- from points to orbits -------------------------------------------------------------------------------------------
 
 
+class _Known(NamedTuple):
+    """What is known of orbits, in natural units: columns of the array that carries derivatives."""
+
+    theta1: Any
+    theta2: Any
+    p1: Any
+    p2: Any
+    end1: Any  # the angles at the arc's end
+    end2: Any
+    time: Any
+    kappa: Any
+    log_abs_kappa: Any
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _implicit(problem: _Problem, known: Any, parameters: Any, point: Any, row: Any, steps: Any) -> Any:
-    """`known` of orbits, shape (m, 7), as a function of (l2/l1, m2/m1, target), shape (m, 3): see `sensitivities`."""
+def _implicit(symmetry: str, known: Any, parameters: Any, points: Any, rows: Any, steps: Any, turns: Any) -> Any:
+    """`known`, shape (m, 9), as a function of (l2/l1, m2/m1, target), shape (m, 3): see `sensitivities`."""
     return known
 
 
+@jax.custom_jvp
+def _once(parameters: Any) -> Any:
+    """Refuses to be differentiated: the points of `_implicit` would not know how they move."""
+    return parameters
+
+
+@_once.defjvp
+def _once_jvp(primals, tangents):  # type: ignore[no-untyped-def]
+    raise ValueError("theta1 must not be differentiated twice on a family: use find_orbit for second derivatives")
+
+
 @_implicit.defjvp
-def _implicit_jvp(problem, primals, tangents):  # type: ignore[no-untyped-def]
-    turns = jnp.asarray(problem.turns)
-    jacobian = sensitivities(problem.natural, *primals[2:], turns, problem.symmetry)
-    return _implicit(problem, *primals), jnp.einsum("mij,mj->mi", jacobian, tangents[1])
+def _implicit_jvp(symmetry, primals, tangents):  # type: ignore[no-untyped-def]
+    _, parameters, points, rows, steps, turns = primals
+    jacobian = sensitivities(_once(parameters)[0, :2], points, rows, steps, turns, symmetry)
+    return _implicit(symmetry, *primals), jnp.einsum("mij,mj->mi", jacobian, tangents[1])
+
+
+@partial(jax.jit, static_argnames="symmetry")
+def _carried(pendulum, targets, known, points, rows, steps, turns, symmetry):  # type: ignore[no-untyped-def]
+    """What is known in SI units, carrying the derivatives of the pendulum and the targets."""
+    ratios = jnp.stack([pendulum.l2 / pendulum.l1, pendulum.m2 / pendulum.m1])
+    parameters = jnp.column_stack([jnp.broadcast_to(ratios, (len(known), 2)), targets])
+    known = _implicit(symmetry, known, parameters, points, rows, steps, turns)
+    fields = _in_units(pendulum, _Known(*known.T), turns, symmetry, jnp)
+    return fields | {"energy": hamiltonian(pendulum, fields["state"])}
+
+
+def _in_units(pendulum: Pendulum, known: _Known, turns: Any, symmetry: str, xp: Any) -> dict[str, Any]:
+    """The fields of an orbit that depend on the pendulum, but for the energy."""
+    second = xp.sqrt(pendulum.l1 / pendulum.g)
+    momentum = pendulum.m1 * pendulum.l1**2 / second
+    state = State(known.theta1, known.theta2, momentum * known.p1, momentum * known.p2)
+    dual = State(2 * np.pi * turns[0] - known.theta1, 2 * np.pi * turns[1] - known.theta2, -state.p1, -state.p2)
+    if symmetry == "brake":
+        dual = State(known.end1, known.end2, dual.p1, dual.p2)
+    return {
+        "pendulum": jax.tree.map(lambda leaf: leaf * xp.ones_like(known.time), pendulum),
+        "state": state,
+        "period": PARTS[symmetry] * second * known.time,
+        "kappa": known.kappa,
+        "log_abs_kappa": known.log_abs_kappa,
+        "dual": dual,
+    }
 
 
 def _orbits(problem: _Problem, rows: Corrected, targets: Any = None, along: Any = None) -> PeriodicOrbit:
@@ -387,41 +456,28 @@ def _orbits(problem: _Problem, rows: Corrected, targets: Any = None, along: Any 
     With `targets`, the values of theta1 at which the rows `along` were solved, everything carries derivatives.
     """
     _, kappa, logarithm = stability_of(rows.matrices, problem.symmetry)
-    known = np.column_stack([rows.point[:, :4], rows.times.sum(axis=1), kappa, logarithm])
-    pendulum = jax.tree.map(known_value, problem.pendulum)
-    xp: Any = np
-    if targets is not None:
-        pendulum, xp = problem.pendulum, jnp
-        ratios = jnp.stack([pendulum.l2 / pendulum.l1, pendulum.m2 / pendulum.m1])
-        parameters = jnp.column_stack([jnp.broadcast_to(ratios, (len(known), 2)), targets])
-        known = _implicit(problem, known, parameters, rows.point, along, rows.steps)
-    second = xp.sqrt(pendulum.l1 / pendulum.g)
-    momentum = pendulum.m1 * pendulum.l1**2 / second
-    theta1, theta2, p1, p2, time, kappa, logarithm = known.T
-    state = State(theta1, theta2, momentum * p1, momentum * p2)
+    time = rows.times.sum(axis=1)
+    start = rows.point[:, :4] * ([1, 1, 1, 1] if problem.symmetry == "odd" else [1, 1, 0, 0])  # at rest, exactly
+    known = np.column_stack([start, rows.end[:, :2], time, kappa, logarithm])
     turns = np.asarray(problem.turns)
-    dual = State(2 * np.pi * turns[0] - theta1, 2 * np.pi * turns[1] - theta2, -state.p1, -state.p2)
-    if problem.symmetry == "brake":
-        dual = State(rows.end[:, 0], rows.end[:, 1], dual.p1, dual.p2)
-    whole = (turns if problem.symmetry == "centred" else 0 * turns).astype(int)
-    period = PARTS[problem.symmetry] * second * time
-    one = np.ones(len(rows.point))
-    orbit = PeriodicOrbit(
-        pendulum=jax.tree.map(lambda leaf: leaf * one, pendulum),
-        state=state,
-        period=period,
-        energy=pendulum.m1 * pendulum.g * pendulum.l1 * rows.energy if xp is np else hamiltonian(pendulum, state),
+    pendulum = jax.tree.map(known_value, problem.pendulum)
+    if targets is None:
+        fields = _in_units(pendulum, _Known(*known.T), turns, problem.symmetry, np)
+        fields["energy"] = pendulum.m1 * pendulum.g * pendulum.l1 * rows.energy
+    else:
+        task = known, rows.point, along, rows.steps, turns
+        fields = _carried(problem.pendulum, targets, *task, problem.symmetry)
+    whole = np.broadcast_to(turns if problem.symmetry == "centred" else 0 * turns, (len(time), 2)).astype(int)
+    period = PARTS[problem.symmetry] * math.sqrt(pendulum.l1 / pendulum.g) * time
+    return PeriodicOrbit(
+        **fields,
         residual=rows.residual,
         iterations=rows.iterations.astype(int),
-        kappa=kappa,
-        log_abs_kappa=logarithm,
-        dual=dual,
-        turns=(whole[0] * one.astype(int), whole[1] * one.astype(int)),
-        error_estimate=(rows.angle_error, rows.time_error * np.asarray(lax.stop_gradient(period))),
+        turns=(whole[:, 0], whole[:, 1]),
+        error_estimate=(rows.angle_error, rows.time_error * period),
         status=np.where(rows.converged > 0, int(Status.CONVERGED), int(Status.MAX_ITERATIONS)),
         symmetry=problem.symmetry,
     )
-    return orbit
 
 
 def _slopes(problem: _Problem, rows: Corrected) -> Slopes:
@@ -435,8 +491,9 @@ def _slopes(problem: _Problem, rows: Corrected) -> Slopes:
     )
 
 
-# The derivative with respect to theta1 is refused where less than this of a step along the curve goes into it.
-_AT_FOLD = 1e-6
+# The derivative with respect to theta1 is refused where less than this share of a step along the curve goes into it,
+# which is nearer to the fold than its square.
+_AT_FOLD = 1e-5
 # Each interval is looked at in this many pieces for passages through an angle.
 _PIECES = 8
 
@@ -465,9 +522,11 @@ def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
     away = np.sqrt(np.sum(METRIC * (solved.point - points) ** 2, axis=1))
     strayed = away > np.maximum(_STRAYED * curve.lengths[np.maximum(index, 0)], 1e-9)
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((theta1, problem.pendulum)))
-    slope = np.abs(solved.tangent[:, 0])
-    if traced and np.any(found & (slope < _AT_FOLD)):
-        angle = wanted.ravel()[np.argmax(found & (slope < _AT_FOLD))]
+    folds = np.array([abs(float(p.orbit.theta1)) for p in family.special_points if p.kind == "fold_theta1"])
+    near = np.any(np.abs(targets[:, None] - folds) < _AT_FOLD**2, axis=1)
+    folded = near | (found & (np.abs(solved.tangent[:, 0]) < _AT_FOLD))
+    if traced and np.any(folded):
+        angle = wanted.ravel()[np.argmax(folded)]
         raise ValueError(
             f"theta1 must not be a fold of the family for a derivative, got {angle}: it is infinite there; the "
             "family's slopes are derivatives with respect to arclength"
@@ -480,10 +539,11 @@ def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
 
     def shaped(leaf: Any) -> Any:
         xp = np if isinstance(leaf, np.ndarray) else jnp
-        leaf = xp.where(found, leaf, np.nan) if np.issubdtype(leaf.dtype, np.floating) else leaf
+        leaf = xp.where(found, leaf, np.nan) if np.issubdtype(leaf.dtype, np.floating) and not all(found) else leaf
         return jnp.asarray(xp.reshape(leaf, wanted.shape))
 
-    return jax.tree.map(shaped, orbits)
+    wide = jax.tree.map(lambda leaf: jnp.reshape(leaf, wanted.shape), orbits.pendulum)
+    return replace(jax.tree.map(shaped, orbits), pendulum=wide)
 
 
 # The cubic is true to a few thousandths of its interval: a root further away than this share of it is another orbit.
@@ -511,9 +571,10 @@ def _passages(curve: _Curve, targets: np.ndarray, crossing: int) -> tuple[np.nda
 
 def _mirrored(orbits: PeriodicOrbit, which: np.ndarray) -> PeriodicOrbit:
     """The mirror image x -> -x of some of the orbits."""
-    sign = np.where(which, -1, 1)
+    sign = np.where(which, -1.0, 1.0)
     state, dual = (jax.tree.map(lambda leaf: sign * leaf, x) for x in (orbits.state, orbits.dual))
-    return replace(orbits, state=state, dual=dual, turns=(sign * orbits.turns[0], sign * orbits.turns[1]))
+    turns = (sign.astype(int) * orbits.turns[0], sign.astype(int) * orbits.turns[1])
+    return replace(orbits, state=state, dual=dual, turns=turns)
 
 
 # --- special points --------------------------------------------------------------------------------------------------
@@ -591,7 +652,7 @@ def _special_points(problem: _Problem, rows: Corrected, curve: _Curve, arclength
     return sorted(points, key=lambda point: float(point.arclength))
 
 
-def _special(problem: _Problem, place: Corrected, where: float, kind: str, branch: Any) -> SpecialPoint:
+def _special(problem: _Problem, place: Corrected, where: Scalar, kind: str, branch: Any) -> SpecialPoint:
     both = _orbits(problem, place), _slopes(problem, place)
     orbit, slopes = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), both)
     return SpecialPoint(jnp.asarray(where), orbit, slopes, kind, _Place(problem, place), branch)
@@ -686,32 +747,25 @@ def _known(pendulum: Pendulum) -> Pendulum:
     return Pendulum(**values)
 
 
-def _from_mode(problem: _Problem, branch: str, longest: float, most: int) -> Family:
-    slow, fast = normal_modes(problem.natural)
-    mode = slow if branch == "in-phase" else fast
-    frequency, ratio = float(mode.frequency), float(mode.ratio)
-    phase = 0.5 * np.pi * np.arange(SEGMENTS) / SEGMENTS
-    moving = momenta(problem.natural, 0.0, 0.0, frequency, frequency * ratio)  # at the bottom
-    shape = [np.cos(phase), ratio * np.cos(phase), -moving.p1 * np.sin(phase), -moving.p2 * np.sin(phase)]
-    tangent = np.append(np.stack(shape, axis=1).ravel(), [0.0, 0.0])
-    tangent /= np.sqrt(tangent @ (METRIC * tangent))
-    # At the bottom the fastest rate is that of the fast mode.
-    delta = 0.5 * np.pi / frequency * float(fast.frequency) / SEGMENTS
-    origin = np.append(np.zeros(UNKNOWNS - 2), [math.log(delta), 0.0])
-    rows, end = problem.followed(_begun(origin, tangent, _FIRST_STEP, 4), None, longest, most)
+_beginning = jax.jit(beginning)
+
+
+def _from_mode(problem: _Problem, branch: str, longest: Scalar, most: int) -> Family:
+    start = jax.tree.map(np.asarray, _beginning(problem.natural, branch == "in-phase"))
+    rows, end = problem.followed(start, None, longest, most)
     curve = _curve_of(rows)
-    points, tangents = np.vstack([origin, curve.points]), np.vstack([tangent, curve.tangents])
-    curve = _Curve(points, tangents, np.append(4, curve.steps))
+    points, tangents = np.vstack([start.point, curve.points]), np.vstack([start.tangent, curve.tangents])
+    curve = _Curve(points, tangents, np.append(start.steps, curve.steps))
     return _family(problem, rows, curve, ("normal mode", end))
 
 
-def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, longest: float, most: int) -> Family:
+def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, longest: Scalar, most: int) -> Family:
     fixed = _known(pendulum)
-    mine = [float(leaf) for leaf in jax.tree.leaves(orbit.pendulum)]
     if np.shape(orbit.period):
         raise ValueError(
             f"start must be a single orbit, got one with shape {np.shape(orbit.period)}: choose one of them"
         )
+    mine = [float(leaf) for leaf in jax.tree.leaves(orbit.pendulum)]
     if not np.allclose(mine, jax.tree.leaves(fixed), rtol=1e-12):
         raise ValueError(f"start must be an orbit of this pendulum, got one of {orbit.pendulum}")
     if int(orbit.status) != Status.CONVERGED:
@@ -737,9 +791,9 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, long
 _SAME_ORBIT = 1e-5
 
 
-def _both_ways(problem: _Problem, rows: Corrected, longest: float, most: int) -> Family:
+def _both_ways(problem: _Problem, rows: Corrected, longest: Scalar, most: int) -> Family:
     """The family through a point, in both directions unless it is closed."""
-    first = min(_FIRST_STEP, longest)
+    first = min(FIRST_STEP, longest)
     start = _begun(rows.point[0], rows.tangent[0], first, rows.steps[0])
     ahead, end = problem.followed(start, rows, longest, most)
     if end == "closed":
@@ -828,7 +882,7 @@ _NO_RANK = 1e-3
 _ONTO_BRANCH = (0.02, 0.005, 0.05, 0.001)
 
 
-def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: float, most: int) -> Family:
+def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: Scalar, most: int) -> Family:
     if special._branch is None:
         raise ValueError(f"start must be a point where a family branches off, got {special.kind}: follow its orbit")
     symmetry, k = special._branch
@@ -847,7 +901,7 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: float
             raise ValueError(
                 f"start must be a point where a family branches off, got {special.kind} without one nearby"
             )
-        start = _begun(rows.point[0], rows.tangent[0], min(_FIRST_STEP, longest), rows.steps[0])
+        start = _begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, longest), rows.steps[0])
         ahead, end = problem.followed(start, rows, longest, most)
         if end == "closed":
             return _closed(problem, rows, ahead)

@@ -26,10 +26,11 @@ from jaxtyping import Array, Float
 
 from dpend._runtime import require_float64
 from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, normal_modes, number, released, vector_field
+from dpend.shooting import SYMMETRIES as ARC_SYMMETRIES
+from dpend.shooting import Arc, Walk, arc_times, beginning, fastest, hermite, natural, stride
 from dpend.stability import half_trace, kappa_of_brake, stability_class, transition
 from dpend.steppers import Scheme
 from dpend.trajectory import Status, known_value, march, moved, step_size
-from dpend.trig import sincos
 
 BRANCHES = ("in-phase", "anti-phase")
 SYMMETRIES = ("centred", "brake")
@@ -134,20 +135,6 @@ def _steps_for(log_time: Scalar, rate: Scalar, turn: Scalar) -> Scalar:
     return jnp.clip(jnp.nan_to_num(wanted, nan=8.0), 8, _MOST_STEPS).astype(int)
 
 
-def _fastest(pendulum: Pendulum, state: State) -> Scalar:
-    """The rate that decides the step [rad/s]: of the linear motion, of the rods, and of the inertia they share.
-
-    The last is 1/(1 + mu sin^2 delta), which a heavy lower bob makes narrow: it changes when the angle delta between
-    the rods does by sqrt(sin^2 delta + 1/mu).
-    """
-    rates = vector_field(pendulum, state)
-    mu = pendulum.m2 / pendulum.m1
-    sin_delta, _ = sincos(state.theta1 - state.theta2)
-    narrow = (1 + mu) / (1 + mu * sin_delta**2)
-    spin = rates.theta1**2 + rates.theta2**2 + narrow * (rates.theta1 - rates.theta2) ** 2
-    return jnp.sqrt(_clock(pendulum) ** 2 + spin)
-
-
 @partial(jax.jit, static_argnames="symmetry")  # traced once for the walk and for Newton's method
 def _shoot(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, symmetry: str, turns: Array) -> _Shot:
     """The equations of `symmetry` for a release at `angles`, after a time exp(log_time) in `steps` steps.
@@ -159,9 +146,9 @@ def _shoot(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, s
 
     def step(carry: Any, time: Scalar, dt: Scalar) -> Any:
         state, tangents = _RK8.advance_tangents(pendulum, carry[0], carry[1], dt)
-        return state, tangents, jnp.fmax(carry[2], _fastest(pendulum, state))
+        return state, tangents, jnp.fmax(carry[2], fastest(pendulum, state))
 
-    start = (state, State(*jnp.eye(4)), _fastest(pendulum, state))
+    start = (state, State(*jnp.eye(4)), fastest(pendulum, state))
     end, tangents, rate = march(step, start, step_size(time, steps), steps)
     matrix = jnp.stack(jax.tree.leaves(tangents))
     slope = vector_field(pendulum, end)
@@ -264,232 +251,109 @@ _SHORTEST = 0.02
 
 # --- following a branch ----------------------------------------------------------------------------------------------
 
-# Arclength steps in (theta1, theta2, log time) [rad]: the first is where the normal mode is still true to 1e-4, the
-# longest turns by less than the angle below on the families of twenty pendulums that were tried.
-_FIRST_STEP, _LONGEST_STEP = 0.02, 0.5
-# A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of the step's length).
-_LEAST_COSINE, _LARGEST_MISS, _WANTED_MISS = 0.95, 0.1, 0.02
-# Newton's second update over its first (Deuflhard's contraction test).
-_LARGEST_CONTRACTION = 0.05
-_MOST_POINTS = 600
-# Where steps must be shorter than this, the integration is as fine as for the digits: its error, grown by the condition
-# of the equations, is what the walk would stumble over.
-_CAREFUL = 0.015
-# Two curves that pass each other closer than this [rad] count as crossing: the walk goes straight on, by a leap
-# along the tangent from before the curve began to turn into the other.
-_CROSSING = 2e-4
-_LEAPS = (0.003, 0.01, 0.03)
-_LARGEST_LEAP_MISS = 0.3
-# Where no leap lands it is a turn, however sharp, and is followed with steps down to this [rad].
-_SHORTEST_STEP = 1e-6
-_WALK_TOLERANCE = 1e-6
-# Closer than this to the upright state [rad] the branch counts as ended in its homoclinic limit.
-_UPRIGHT = 1e-4
-# Back within this of the normal mode it started from [rad], the branch is a closed curve.
-_AT_ORIGIN = 0.05
+# The longest step in arclength: its cubic is true to a thousandth, from where Newton's method goes on.
+_LONGEST_STEP = 0.25
+_MOST_POINTS = 5000
 # Each step is looked at in this many pieces for crossings: no step turns enough to cross twice within one of them.
 _PIECES = 16
 
 
-class _Corrected(NamedTuple):
-    """A point of a family.
+class _Search(NamedTuple):
+    """A walk along a branch to where it meets the wanted release."""
 
-    Attributes:
-        point, tangent: where it is, and the unit tangent, which goes on in the old one's direction.
-        side: the sign with which the Jacobian's cross product had to be taken for that. It is constant along a curve,
-            and changes on a jump across the gap to another one that runs close by.
-        rate: the largest one met on the orbit [rad/s].
-        contraction: the second Newton update over the first: small if the prediction was in reach of this curve alone.
-        iterations, converged: of Newton's method.
-    """
-
-    point: Float[Array, "3"]
-    tangent: Float[Array, "3"]
-    side: Scalar
-    rate: Scalar
-    contraction: Scalar
-    iterations: Scalar
-    converged: Scalar
-
-
-def _corrected(
-    pendulum: Pendulum, predicted: Array, tangent: Array, steps: Scalar, turns: Array, symmetry: str, tolerance: Scalar
-) -> _Corrected:
-    """The point of the family in the plane through `predicted` normal to `tangent`: the step that families repeat.
-
-    The unknowns are (theta1, theta2, log of the shooting time). Both the bordered 3 x 3 system and the new tangent, the
-    null vector of the Jacobian, are written with cross products (Cramer's rule).
-    """
-
-    def iterate(carry: tuple) -> tuple:
-        point, _, _, size, ratio, count = carry
-        shot = _shoot(pendulum, point[:2], point[2], steps, symmetry, turns)
-        one, two = shot.jacobian
-        null = jnp.cross(one, two)
-        columns = jnp.stack([jnp.cross(two, tangent), jnp.cross(tangent, one), null])
-        short = jnp.append(shot.value, tangent @ (point - predicted))
-        update = -(short @ columns) / (null @ tangent)
-        new_size = jnp.max(jnp.abs(update))
-        ratio = jnp.where(count == 1, new_size / size, ratio)
-        return point + update, null, shot.rate, new_size, ratio, count + 1
-
-    def unfinished(carry: tuple) -> Scalar:
-        _, _, _, size, ratio, count = carry
-        return (count == 0) | ((size > tolerance) & (size < 1.0) & (ratio < 1.0) & (count < 6))
-
-    zero = jnp.asarray(0.0)
-    start = (predicted, tangent, zero, zero, zero, jnp.asarray(0))
-    point, null, rate, size, ratio, count = lax.while_loop(unfinished, iterate, start)
-    new = null / jnp.linalg.norm(null)
-    side = jnp.where(new @ tangent < 0, -1.0, 1.0)
-    return _Corrected(point, side * new, side, rate, ratio, count, size <= tolerance)
-
-
-class _Piece(NamedTuple):
-    """A step along a family as a cubic: its ends, the unit tangents there, and the distance between them."""
-
-    start: Float[Array, "3"]
-    slope: Float[Array, "3"]
-    end: Float[Array, "3"]
-    end_slope: Float[Array, "3"]
-    length: Scalar
-
-    def at(self, s: Scalar) -> Array:
-        """The cubic Hermite interpolant at s in [0, 1]; beyond 1 it predicts the next point."""
-        s2, s3 = s * s, s * s * s
-        return (
-            (2 * s3 - 3 * s2 + 1) * self.start
-            + (s3 - 2 * s2 + s) * self.length * self.slope
-            + (3 * s2 - 2 * s3) * self.end
-            + (s3 - s2) * self.length * self.end_slope
-        )
-
-
-class _Walk(NamedTuple):
-    piece: _Piece
-    side: Scalar
-    straight: Float[Array, "3"]
-    step: Scalar
-    leaps: Scalar
-    rate: Scalar
+    walk: Walk
     iterations: Scalar
     points: Scalar
     attempts: Scalar
     crossings: Scalar
-    best: Float[Array, "3"]
-    reach: Float[Array, "3"]
-    away: Scalar
+    best: Float[Array, " D"]
+    reach: Float[Array, " D"]
     found: Scalar
     status: Scalar
 
 
-def _walk(pendulum: Pendulum, mode: Any, target: Scalar, crossing: Scalar, ratio: int | None) -> _Walk:
+def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar, ratio: int | None) -> _Search:
     """Follows a centred family from its normal mode to where it meets the wanted release.
 
     Without `ratio` that is the `crossing`-th time that |theta1| = target; the orbit released at (-theta1, -theta2) is
     the same one, half a period later. With `ratio` it is the release with theta2 = ratio theta1 nearest to `target`.
     """
-    origin = jnp.stack([0.0, 0.0, jnp.log(mode.period / 4)])
-    slope = jnp.stack([1.0, mode.ratio, 0.0]) / jnp.sqrt(1 + mode.ratio**2)
-    turns = jnp.zeros(2)
+    scaled = natural(pendulum)
+    arc = Arc(jnp.asarray(ARC_SYMMETRIES.index("centred")), jnp.zeros(2))
 
-    def wanted(point: Array) -> Scalar:
-        return jnp.abs(point[0]) - target if ratio is None else point[1] - ratio * point[0]
+    def wanted(angles: Array) -> Array:
+        return jnp.abs(angles[0]) - target if ratio is None else angles[1] - ratio * angles[0]
 
-    def advance(w: _Walk) -> _Walk:
-        piece = w.piece
-        leaping = (w.leaps > 0) & (w.leaps <= len(_LEAPS))
-        tangent = jnp.where(leaping, w.straight, piece.end_slope)
-        # The cubic predicts up to twice its own length; without one behind, or for a leap, the tangent does.
-        near = (w.step <= 2.1 * piece.length) & ~leaping
-        along = 1 + jnp.where(near, w.step / piece.length, 0.0)
-        predicted = jnp.where(near, piece.at(along), piece.end + w.step * tangent)
-        turn = jnp.where(w.step < _CAREFUL, _FINE, _COARSE)
-        steps = _steps_for(predicted[2], w.rate, turn)
-        new = _corrected(pendulum, predicted, tangent, steps, turns, "centred", _WALK_TOLERANCE)
-        miss = jnp.max(jnp.abs(new.point - predicted)) / w.step
-        resolved = 2 * _steps_for(new.point[2], new.rate, turn) <= 3 * steps
-        smooth = ((new.side == w.side) | (w.points == 0)) & (new.contraction <= _LARGEST_CONTRACTION)
-        smooth = jnp.where(leaping, miss <= _LARGEST_LEAP_MISS, smooth & (miss <= _LARGEST_MISS))
-        good = new.converged & smooth & (new.tangent @ tangent >= _LEAST_COSINE)
-        length = jnp.linalg.norm(new.point - piece.end)
-        taken = _Piece(piece.end, piece.end_slope, new.point, new.tangent, length)
-        growth = jnp.clip((_WANTED_MISS / jnp.fmax(miss, 1e-9)) ** 0.25, 0.5, 2.0)
-        held = jnp.where(good | ~new.converged, w.rate, jnp.fmax(w.rate, new.rate))
-        after = w._replace(
-            piece=taken,
-            side=new.side,
-            straight=jnp.where(w.step >= 10 * _CROSSING, new.tangent, w.straight),
-            step=jnp.minimum(w.step * growth, _LONGEST_STEP),
-            leaps=jnp.where(leaping | (w.step >= 2 * _CROSSING), 0, w.leaps),
-            rate=new.rate,
+    def advance(s: _Search) -> _Search:
+        walk, new, taken, end = stride(scaled, s.walk, jnp.asarray(_LONGEST_STEP), arc)
+        further = jnp.abs(new.point[0]) > jnp.abs(s.reach[0])
+        after = s._replace(
+            walk=walk,
             iterations=new.iterations,
-            points=w.points + 1,
-            reach=jnp.where(jnp.abs(new.point[0]) > jnp.abs(w.reach[0]), new.point, w.reach),
+            points=s.points + 1,
+            reach=jnp.where(further, new.point, s.reach),
+            status=jnp.where(end == 1, jnp.where(s.found, Status.CONVERGED, Status.NO_SUCH_ORBIT), _RUNNING),
         )
-        after = _looked_at(after, wanted, target, crossing, ratio, origin)
-        # Where even the shortest step is refused, the curve all but meets another: straight on, over the place.
-        further = leaping | (w.step < 2 * jnp.where(w.leaps > 0, _SHORTEST_STEP, _CROSSING))
-        leaps = jnp.where(good | ~further, w.leaps, w.leaps + 1)
-        shorter = jnp.where(leaps == w.leaps, w.step / 2, jnp.asarray([*_LEAPS, _CROSSING, 0.0])[leaps - 1])
-        back = w._replace(step=jnp.where(good, w.step, shorter), rate=jnp.where(good, new.rate, held), leaps=leaps)
-        chosen = jax.tree.map(partial(jnp.where, good & resolved), after, back)
-        gave_up = (leaps > len(_LEAPS) + 1) | (chosen.points >= _MOST_POINTS) | (w.attempts >= 3 * _MOST_POINTS)
-        status = jnp.where((chosen.status == _RUNNING) & gave_up, Status.LEFT_BRANCH, chosen.status)
-        return chosen._replace(attempts=w.attempts + 1, status=status)
+        after = _looked_at(after, wanted, target, crossing, ratio)
+        before = s._replace(walk=walk, status=jnp.where(end == 2, Status.LEFT_BRANCH, _RUNNING))
+        s = jax.tree.map(partial(jnp.where, taken), after, before)
+        gave_up = (s.points >= _MOST_POINTS) | (s.attempts >= 3 * _MOST_POINTS)
+        status = jnp.where((s.status == _RUNNING) & gave_up, Status.LEFT_BRANCH, s.status)
+        return s._replace(attempts=s.attempts + 1, status=status)
 
+    begin = beginning(scaled, slow)
+    finite = jnp.isfinite(target + jnp.sum(begin.point) + jnp.sum(begin.tangent))
     zero = jnp.asarray(0)
-    finite = jnp.isfinite(target + jnp.sum(origin) + jnp.sum(slope))
-    start = _Walk(
-        _Piece(origin, slope, origin, slope, jnp.asarray(0.0)),
-        side=jnp.asarray(0.0), straight=slope, step=jnp.asarray(_FIRST_STEP), leaps=zero, rate=_clock(pendulum),
-        iterations=zero, points=zero, attempts=zero, crossings=zero, best=origin, reach=origin, away=jnp.asarray(False),
+    start = _Search(
+        begin, iterations=zero, points=zero, attempts=zero, crossings=zero, best=begin.point, reach=begin.point,
         found=jnp.asarray(False), status=jnp.where(finite, _RUNNING, Status.NONFINITE),
     )  # fmt: skip
-    return lax.while_loop(lambda w: w.status == _RUNNING, advance, start)
+    return lax.while_loop(lambda s: s.status == _RUNNING, advance, start)
 
 
-def _looked_at(walk: _Walk, wanted: Any, target: Scalar, crossing: Scalar, ratio: int | None, origin: Array) -> _Walk:
-    """The walk after its newest step has been searched for the wanted release and for the end of the branch."""
-    points = jax.vmap(walk.piece.at)(jnp.arange(_PIECES + 1) / _PIECES)
+def _looked_at(s: _Search, wanted: Any, target: Scalar, crossing: Scalar, ratio: int | None) -> _Search:
+    """The search after its newest step has been looked at for the wanted release."""
+    w = s.walk
+
+    def at(share: Scalar) -> Array:
+        return hermite(w.behind, w.behind_tangent, w.point, w.tangent, w.length, share)
+
+    points = jax.vmap(at)(jnp.arange(_PIECES + 1) / _PIECES)
     values = jax.vmap(wanted)(points)
     changes = values[:-1] * values[1:] < 0
-    seen = walk.crossings + jnp.cumsum(changes)
+    seen = s.crossings + jnp.cumsum(changes)
     if ratio is None:
         here = changes & (seen == crossing)
     else:
         nearness = jnp.where(changes, jnp.abs(jnp.abs(points[1:, 0]) - target), jnp.inf)
-        closer = jnp.min(nearness) < jnp.where(walk.found, jnp.abs(jnp.abs(walk.best[0]) - target), jnp.inf)
+        closer = jnp.min(nearness) < jnp.where(s.found, jnp.abs(jnp.abs(s.best[0]) - target), jnp.inf)
         here = (jnp.arange(_PIECES) == jnp.argmin(nearness)) & closer
     hit = jnp.any(here)
     left = jnp.argmax(here) / _PIECES
-    sign = jnp.sign(wanted(walk.piece.at(left)))
+    sign = jnp.sign(wanted(at(left)))
 
     def halve(_: Scalar, bounds: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = bounds
         middle = 0.5 * (low + high)
-        before = wanted(walk.piece.at(middle)) * sign > 0
+        before = wanted(at(middle)[:2]) * sign > 0
         return jnp.where(before, middle, low), jnp.where(before, high, middle)
 
     low, high = lax.fori_loop(0, 50, halve, (left, left + 1 / _PIECES))
-    amplitude = jnp.max(jnp.abs(points[:, :2]), axis=1)
-    closed = walk.away & jnp.any((amplitude < _AT_ORIGIN) & (jnp.abs(points[:, 2] - origin[2]) < _AT_ORIGIN))
-    from_upright = jnp.abs(jnp.mod(walk.piece.end[:2], 2 * jnp.pi) - jnp.pi)
-    ended = closed | (jnp.max(from_upright) < _UPRIGHT)
-    found = walk.found | hit
-    over = jnp.where(found, Status.CONVERGED, Status.NO_SUCH_ORBIT)
-    if ratio is None:
-        stop = ended | hit
-    else:  # further on only a branch that turned back could come nearer to the target
-        best = jnp.where(hit, walk.piece.at(0.5 * (low + high)), walk.best)
-        stop = ended | (found & (jnp.abs(walk.piece.end[0]) - target > jnp.abs(jnp.abs(best[0]) - target)))
-    return walk._replace(
-        crossings=seen[-1],
-        best=jnp.where(hit, walk.piece.at(0.5 * (low + high)), walk.best),
-        away=walk.away | (amplitude[-1] > 4 * _AT_ORIGIN),
-        found=found,
-        status=jnp.where(stop, over, walk.status),
-    )
+    best = jnp.where(hit, at(0.5 * (low + high)), s.best)
+    found = s.found | hit
+    # With `ratio`, further on only a branch that turned back could come nearer to the target.
+    over = hit
+    if ratio is not None:
+        over = found & (jnp.abs(w.point[0]) - target > jnp.abs(jnp.abs(best[0]) - target))
+    status = jnp.where(over, Status.CONVERGED, s.status)
+    return s._replace(crossings=seen[-1], best=best, found=found, status=status)
+
+
+def _timed(pendulum: Pendulum, point: Array) -> tuple[Scalar, Scalar]:
+    """The log of a point's shooting time [s], and the largest rate at its nodes [rad/s]."""
+    second = jnp.sqrt(pendulum.l1 / pendulum.g)
+    times, rates = arc_times(natural(pendulum), point)
+    return jnp.log(jnp.sum(times) * second), jnp.max(rates) / second
 
 
 # --- from a root to an orbit -----------------------------------------------------------------------------------------
@@ -663,12 +527,11 @@ def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, 
     fixed = lax.stop_gradient(pendulum)
     sign = jnp.where(theta1 < 0, -1.0, 1.0)
     target = jnp.abs(theta1)
-    modes = normal_modes(fixed)
-    mode = jax.tree.map(lambda a, b: jnp.where(slow, a, b), *modes)
-    walk = _walk(fixed, mode, lax.stop_gradient(target), crossing, ratio)
-    found = walk.found
-    guess = jnp.where(found, walk.best, walk.reach)
-    guess = guess.at[:2].multiply(jnp.where(guess[0] < 0, -1.0, 1.0))  # the same orbit, from its other rest
+    search = _searched(fixed, slow, lax.stop_gradient(target), crossing, ratio)
+    found = search.found
+    point = jnp.where(found, search.best, search.reach)
+    log_time, rate = _timed(fixed, point)
+    guess = point[:2] * jnp.where(point[0] < 0, -1.0, 1.0)  # the same orbit, from its other rest
     if ratio is None:
         release = jnp.where(found, target, guess[0])
         # The cubic's theta2 belongs to the cubic's theta1, which is off by rounding where the target is tiny.
@@ -679,11 +542,11 @@ def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, 
         line = _Line(jnp.zeros(2), jnp.array([1.0, ratio]))
     settings = _Settings(turn, tolerance, jnp.where(found, max_iterations, 1), error)
     turns = jnp.zeros(2)
-    newton, steps, change = _solved(fixed, lax.stop_gradient(line), x, guess[2], walk.rate, turns, "centred", settings)
-    moved = jnp.abs(newton.x - x) > _LEFT * jnp.maximum(walk.piece.length, jnp.abs(x))
+    newton, steps, change = _solved(fixed, lax.stop_gradient(line), x, log_time, rate, turns, "centred", settings)
+    moved = jnp.abs(newton.x - x) > _LEFT * jnp.maximum(search.walk.length, jnp.abs(x))
     status = jnp.where((newton.status == Status.CONVERGED) & moved, Status.LEFT_BRANCH, newton.status)
-    status = jnp.where(found, status, walk.status)
-    newton = newton._replace(iterations=newton.iterations + walk.iterations)
+    status = jnp.where(found, status, search.status)
+    newton = newton._replace(iterations=newton.iterations + search.iterations)
     orbit = _orbit(pendulum, line, newton, steps, change, turns, "centred", status)
     return _mirrored(orbit, sign)
 
@@ -728,10 +591,10 @@ def _rate_along(pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, st
 
     def step(carry: Any, time: Scalar, dt: Scalar) -> Any:
         state = _RK8.advance(pendulum, carry[0], dt)
-        return state, jnp.fmax(carry[1], _fastest(pendulum, state))
+        return state, jnp.fmax(carry[1], fastest(pendulum, state))
 
     dt = step_size(jnp.exp(log_time), steps)
-    end, rate = march(step, (state, _fastest(pendulum, state)), dt, steps)
+    end, rate = march(step, (state, fastest(pendulum, state)), dt, steps)
     return rate, jnp.stack([end.theta1, end.theta2])
 
 

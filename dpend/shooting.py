@@ -22,10 +22,20 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from dpend.pendulum import Pendulum, Scalar, State, equilibria, fast_frequency, hamiltonian, vector_field
+from dpend.pendulum import (
+    Pendulum,
+    Scalar,
+    State,
+    equilibria,
+    fast_frequency,
+    hamiltonian,
+    momenta,
+    normal_modes,
+    vector_field,
+)
 from dpend.stability import transition
 from dpend.steppers import Scheme
-from dpend.trajectory import moved
+from dpend.trajectory import moved, step_size
 from dpend.trig import sincos
 
 # Two AVX-512 registers of lanes; the linear algebra grows with the third power of this number.
@@ -101,7 +111,7 @@ def _segments(pendulum: Pendulum, nodes: Array, delta: Scalar, steps: Scalar) ->
     rate, pull = jax.vjp(lambda states: fastest(pendulum, states), states)
     (gradient,) = pull(jnp.ones(SEGMENTS))
     time = delta / rate
-    end, matrix = transition(pendulum, states, time / steps, steps, _METHOD)
+    end, matrix = transition(pendulum, states, step_size(time, steps), steps, _METHOD)
     return _Segments(
         end=_stack(end).T,
         matrix=jnp.moveaxis(matrix, -1, 0),
@@ -110,6 +120,12 @@ def _segments(pendulum: Pendulum, nodes: Array, delta: Scalar, steps: Scalar) ->
         stretch=(-time / rate * _stack(gradient)).T,
         turn=jnp.maximum(delta, fastest(pendulum, end) * time),
     )
+
+
+def arc_times(pendulum: Pendulum, point: Array) -> tuple[Array, Array]:
+    """The durations of a point's segments and the rates at its nodes."""
+    rates = fastest(pendulum, State(*point[:_LOG_DELTA].reshape(SEGMENTS, 4).T))
+    return jnp.exp(point[_LOG_DELTA]) / rates, rates
 
 
 class _Equations(NamedTuple):
@@ -266,7 +282,7 @@ def _units(pendulum: Pendulum) -> Array:
     return jnp.append(nodes, jnp.ones(2))
 
 
-def corrected(pendulum: Pendulum, predicted: Array, row: Array, steps: Scalar, arc: Arc) -> Corrected:
+def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: Arc) -> Corrected:
     """The point of the family in the plane through `predicted` that `row` is normal to, by Newton's method.
 
     The last iteration takes half the step from where the others ended; its update, not made, is the error estimate.
@@ -281,8 +297,8 @@ def corrected(pendulum: Pendulum, predicted: Array, row: Array, steps: Scalar, a
         factors, pivots = jax.scipy.linalg.lu_factor(bordered)
         one = jnp.zeros(UNKNOWNS).at[-1].set(1.0)
         update, null = jax.scipy.linalg.lu_solve((factors, pivots), jnp.stack([-short, one], axis=1)).T
-        swaps = jnp.sum(pivots != jnp.arange(UNKNOWNS)) % 2
-        side = jnp.prod(jnp.sign(jnp.diagonal(factors))) * (1 - 2 * swaps)
+        swaps = jnp.sum(pivots != jnp.arange(UNKNOWNS, dtype=pivots.dtype)) % 2
+        side = jnp.prod(jnp.sign(jnp.diagonal(factors))) * jnp.where(swaps == 0, 1.0, -1.0)
         size = jnp.max(jnp.abs(update) / unit)
         iterations = n.iterations + 1
         contraction = jnp.where(iterations == 2, size / n.size, n.contraction)
@@ -338,7 +354,7 @@ def corrected(pendulum: Pendulum, predicted: Array, row: Array, steps: Scalar, a
     )
 
 
-def hermite(start: Array, slope: Array, end: Array, end_slope: Array, length: Scalar, s: Scalar) -> Array:
+def hermite(start: Any, slope: Any, end: Any, end_slope: Any, length: Any, s: Any) -> Any:
     """The cubic through two points with unit tangents, `length` apart, at s in [0, 1]; beyond 1 it predicts."""
     s2, s3 = s * s, s * s * s
     return (
@@ -349,6 +365,8 @@ def hermite(start: Array, slope: Array, end: Array, end_slope: Array, length: Sc
     )
 
 
+# The first step from a normal mode, where the linear motion is true to 1e-4.
+FIRST_STEP = 0.02
 # A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of the step's length).
 _LEAST_COSINE, _LARGEST_MISS, _WANTED_MISS = 0.95, 0.2, 0.02
 # Newton's second update over its first (Deuflhard's contraction test), where they are not both small.
@@ -376,6 +394,23 @@ class Walk(NamedTuple):
     steps: Any
     straight: Any  # the last tangent that no curve close by had bent
     leap: Any  # 1 if the next step is one, 2 after one that did not land
+
+
+def beginning(pendulum: Pendulum, slow: Scalar) -> Walk:
+    """A walk at zero amplitude, about to follow the slow or the fast normal mode (natural units)."""
+    modes = normal_modes(pendulum)
+    mode = jax.tree.map(lambda a, b: jnp.where(slow, a, b), *modes)
+    phase = 0.5 * jnp.pi / SEGMENTS * jnp.arange(SEGMENTS, dtype=jnp.float64)
+    moving = momenta(pendulum, 0.0, 0.0, mode.frequency, mode.frequency * mode.ratio)  # at the bottom
+    shape = [jnp.cos(phase), mode.ratio * jnp.cos(phase), -moving.p1 * jnp.sin(phase), -moving.p2 * jnp.sin(phase)]
+    tangent = jnp.append(jnp.stack(shape, axis=1).ravel(), jnp.zeros(2))
+    tangent = tangent / jnp.sqrt(tangent @ (METRIC * tangent))
+    # There the fastest rate is that of the fast mode.
+    delta = 0.5 * jnp.pi / mode.frequency * modes[1].frequency / SEGMENTS
+    point = jnp.append(jnp.zeros(_LOG_DELTA), jnp.stack([jnp.log(delta), 0.0]))
+    nothing = jnp.zeros(())
+    first, steps = jnp.asarray(FIRST_STEP), jnp.asarray(4)
+    return Walk(point, tangent, point, tangent, nothing, first, nothing, steps, tangent, jnp.asarray(0))
 
 
 class Tasks(NamedTuple):
@@ -407,30 +442,24 @@ def walk(
         Where the walk stands, a table whose rows are `Corrected`, how many there are, and whether the family has ended
         (1), or no step is short enough (2).
     """
-    levels = equilibria(pendulum).energy
-    unit = levels[3]  # upright: the weights' torques
     given = tasks.number > 0
     most = jnp.where(given, tasks.number, CHUNK)
 
     def advance(carry: tuple) -> tuple:
         w, table, count, _ = carry
-        near = (w.step <= 2.1 * w.length) & (w.length > 0)
-        ahead = w.step / jnp.where(w.length > 0, w.length, 1.0)
-        cubic = hermite(w.behind, w.behind_tangent, w.point, w.tangent, w.length, 1 + ahead)
-        tangent = jnp.where(w.leap == 1, w.straight, w.tangent)
-        predicted = jnp.where(near & (w.leap != 1), cubic, w.point + w.step * tangent)
+        ahead, along = _ahead(w)
         new = corrected(
             pendulum,
-            jnp.where(given, tasks.points[count], predicted),
-            jnp.where(given, tasks.rows[count], METRIC * tangent),
-            jnp.where(given, tasks.steps[count], w.steps).astype(int),
+            jnp.where(given, tasks.points[count], ahead),
+            jnp.where(given, tasks.rows[count], METRIC * along),
+            jnp.where(given, tasks.steps[count], w.steps),
             arc,
         )
         row = jnp.concatenate([jnp.ravel(jnp.asarray(leaf, jnp.float64)) for leaf in new])
         table = table.at[count].set(row)  # a point taken back is overwritten by the next
-        after, taken, status = _judged(w, new, predicted, longest, levels, unit)
+        after, taken, status = _judged(pendulum, w, new, longest)
         after = jax.tree.map(partial(jnp.where, given), w, after)
-        return after, table, count + (taken | given), jnp.where(given, 0, status)
+        return after, table, count + (taken | given).astype(int), jnp.where(given, 0, status)
 
     def going(carry: tuple) -> Scalar:
         return (carry[2] < most) & (carry[3] == 0)
@@ -439,9 +468,26 @@ def walk(
     return lax.while_loop(going, advance, begin)
 
 
-def _judged(
-    w: Walk, new: Corrected, predicted: Array, longest: Scalar, levels: Array, unit: Scalar
-) -> tuple[Walk, Scalar, Scalar]:
+def stride(pendulum: Pendulum, w: Walk, longest: Scalar, arc: Arc) -> tuple[Walk, Corrected, Scalar, Scalar]:
+    """One step of a walk, or an attempt: where it stands then, the point, whether it was taken, and the status that
+    `walk` gives.
+    """
+    ahead, along = _ahead(w)
+    new = corrected(pendulum, ahead, METRIC * along, w.steps, arc)
+    after, taken, status = _judged(pendulum, w, new, longest)
+    return after, new, taken, status
+
+
+def _ahead(w: Walk) -> tuple[Array, Array]:
+    """The predicted point, by the cubic if it is not much longer than the last step, and the direction it lies in."""
+    near = (w.step <= 2.1 * w.length) & (w.length > 0) & (w.leap != 1)
+    share = 1 + w.step / jnp.where(w.length > 0, w.length, 1.0)
+    cubic = hermite(w.behind, w.behind_tangent, w.point, w.tangent, w.length, share)
+    along = jnp.where(w.leap == 1, w.straight, w.tangent)
+    return jnp.where(near, cubic, w.point + w.step * along), along
+
+
+def _judged(pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar) -> tuple[Walk, Scalar, Scalar]:
     """The walk after a step, whether that was taken or taken back, and how the family stands."""
     miss = new.miss / w.step
     leaping = w.leap == 1
@@ -452,6 +498,8 @@ def _judged(
     good = new.converged & smooth & ((METRIC * new.tangent) @ tangent >= _LEAST_COSINE)
     taken = good & (2 * new.steps <= 3 * w.steps)
     growth = jnp.clip((_WANTED_MISS / jnp.fmax(miss, 1e-9)) ** 0.25, 0.5, 2.0)
+    levels = equilibria(pendulum).energy
+    unit = levels[3]  # upright: the weights' torques
     gaps = (new.energy - levels) / unit
     falling = new.energy_slope < 0
     # Not past the bottom, where the curve goes on as its own mirror image.
@@ -488,7 +536,7 @@ def _judged(
 # --- stability, derivatives, and arcs of other orbits ----------------------------------------------------------------
 
 
-def stability_of(matrices: Array, symmetry: str, xp: Any = np) -> tuple[Array, Array, Array]:
+def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, Any]:
     """c (NaN for brake orbits), kappa and log |kappa| from the segments' matrices, shape (..., S, 4, 4).
 
     With M the arc's matrix: c = 1 - 2 tr(a^T d) if centred, (tr(-M) - 2)/2 if odd, kappa = 2 c^2 - 1; kappa = 1 + 2
@@ -519,7 +567,7 @@ def stability_of(matrices: Array, symmetry: str, xp: Any = np) -> tuple[Array, A
     return value, kappa, xp.where(inner, twice, _log_abs(xp.where(inner, 1.0, kappa), xp))
 
 
-def _log_abs(value: Array, xp: Any) -> Array:
+def _log_abs(value: Any, xp: Any) -> Any:
     zero = value == 0
     return xp.where(zero, -xp.inf, xp.log(abs(xp.where(zero, 1.0, value))))
 
@@ -530,48 +578,47 @@ _LARGEST_EXPONENT, _MANY_DIGITS, _LARGEST_C = 700.0, 20.0, 1e150
 
 @partial(jax.jit, static_argnames="symmetry")
 def sensitivities(
-    pendulum: Pendulum, points: Array, rows: Array, steps: Array, turns: Array, symmetry: str
-) -> Float[Array, "m 7 3"]:
+    ratios: Array, points: Array, rows: Array, steps: Array, turns: Array, symmetry: str
+) -> Float[Array, "m 9 3"]:
     """Derivatives of what is known of orbits at row . point = target, by the implicit function theorem.
 
+    Arguments:
+        ratios: l2/l1 and m2/m1.
     Returns:
-        Of the first node, the arc's time, kappa and log |kappa| (natural units) with respect to l2/l1, m2/m1 and the
-        target.
+        Of the first node, the angles at the end, the arc's time, kappa and log |kappa| (natural units) with respect to
+        the ratios and the target.
     """
 
     def one(task: tuple) -> Array:
         point, row, count = task
-        return _sensitivity(pendulum, point, row, count.astype(int), turns, symmetry)
+        return _sensitivity(ratios, point, row, count.astype(int), turns, symmetry)
 
     return lax.map(one, (points, rows, steps))
 
 
-def _sensitivity(pendulum: Pendulum, point: Array, row: Array, steps: Scalar, turns: Array, symmetry: str) -> Array:
+def _sensitivity(ratios: Array, point: Array, row: Array, steps: Scalar, turns: Array, symmetry: str) -> Array:
     arc = Arc(jnp.asarray(SYMMETRIES.index(symmetry)), turns)
 
-    def with_ratios(ratios: Array) -> Pendulum:
-        return Pendulum(pendulum.l1, ratios[0], pendulum.m1, ratios[1], pendulum.g)
-
     def ends(ratios: Array) -> Array:
-        here = with_ratios(ratios)
+        here = Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0)
         nodes = point[:_LOG_DELTA].reshape(SEGMENTS, 4)
         time = jnp.exp(point[_LOG_DELTA]) / fastest(here, State(*nodes.T))
-        end = _stack(moved(_METHOD, here, State(*nodes.T), time / steps, steps)).T
+        end = _stack(moved(_METHOD, here, State(*nodes.T), step_size(time, steps), steps)).T
         conditions, _ = _end_conditions(here, nodes[0], end[-1], point[_UNFOLDING], arc)
         return jnp.concatenate([(end[:-1] - nodes[1:]).ravel(), conditions])
 
     def known(both: Array) -> Array:
         point, ratios = both[:-2], both[-2:]
-        here = with_ratios(ratios)
+        here = Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0)
 
         states = State(*point[:_LOG_DELTA].reshape(SEGMENTS, 4).T)
         times = jnp.exp(point[_LOG_DELTA]) / fastest(here, states)
-        _, matrices = transition(here, states, times / steps, steps, _METHOD)
+        end, matrices = transition(here, states, step_size(times, steps), steps, _METHOD)
         _, kappa, logarithm = stability_of(jnp.moveaxis(matrices, -1, 0), symmetry, jnp)
-        return jnp.concatenate([point[:4], jnp.stack([jnp.sum(times), kappa, logarithm])])
+        last = jnp.stack([end.theta1[-1], end.theta2[-1], jnp.sum(times), kappa, logarithm])
+        return jnp.concatenate([point[:4], last])
 
-    ratios = jnp.stack([pendulum.l2, pendulum.m2])
-    jacobian = _equations(pendulum, point, steps, arc).jacobian
+    jacobian = _equations(Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0), point, steps, arc).jacobian
     by_ratios = jax.jacfwd(ends)(ratios)
     right = jnp.zeros((UNKNOWNS, 3)).at[:-1, :2].set(-by_ratios).at[-1, 2].set(1.0)
     moves = jnp.linalg.solve(jnp.concatenate([jacobian, row[None]]), right)
@@ -602,7 +649,7 @@ def laid(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -> A
         nearest = jnp.searchsorted(times, time, side="right") - 1
         rest = time - times[nearest]
         steps = jnp.clip(jnp.ceil(rest * rate / _TURN), 1, 100 * _MOST_STEPS).astype(int)
-        return _stack(moved(_METHOD, pendulum, State(*states[nearest]), rest / steps, steps))
+        return _stack(moved(_METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps))
 
     def nodes(delta: Scalar) -> tuple[Scalar, Array]:
         def step(time: Scalar, _: None) -> tuple[Scalar, Array]:
