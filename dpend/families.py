@@ -654,8 +654,8 @@ def _special_points(problem: _Problem, rows: Corrected, curve: _Curve, arclength
 
 def _special(problem: _Problem, place: Corrected, where: Scalar, kind: str, branch: Any) -> SpecialPoint:
     both = _orbits(problem, place), _slopes(problem, place)
-    orbit, slopes = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), both)
-    return SpecialPoint(jnp.asarray(where), orbit, slopes, kind, _Place(problem, place), branch)
+    orbit, slopes = jax.tree.map(lambda leaf: leaf[0], both)
+    return SpecialPoint(where, orbit, slopes, kind, _Place(problem, place), branch)
 
 
 def _roots(problem: _Problem, curve: _Curve, found: list, index: np.ndarray) -> tuple:
@@ -664,25 +664,41 @@ def _roots(problem: _Problem, curve: _Curve, found: list, index: np.ndarray) -> 
     at_low, at_high = (np.array([entry[k] for entry in found]) for k in (2, 3))
     positive = at_low > 0
     lengths = curve.lengths[index]
-    share, last = np.full(len(found), np.inf), np.zeros(len(found))
+    share, value, last = (np.full(len(found), start) for start in (np.inf, np.inf, 0.0))
+    going, rows = np.arange(len(found)), None
     for _ in range(_ROUNDS):
         with np.errstate(invalid="ignore", over="ignore"):
             secant = (low * at_high - high * at_low) / (at_high - at_low)
         inside = np.isfinite(secant) & (secant > low) & (secant < high)
         secant = np.where(inside, secant, 0.5 * (low + high))
-        step, share = np.abs(secant - share) * lengths, secant
-        tangents = curve.tangents_between(index, share)
-        rows = problem.corrected(curve.between(index, share), METRIC * tangents, curve.steps[index + 1])
+        step, share[going] = np.abs(secant - share) * lengths, secant[going]
+        tangents = curve.tangents_between(index, share)[going]
+        points, normals = curve.between(index, share)[going], METRIC * tangents
+        if rows is None:
+            rows = problem.corrected(points, normals, curve.steps[index + 1])
+        else:  # from the last one, along its tangent into the new plane
+            near = _some(rows, going)
+            way = np.sum(normals * (points - near.point), axis=1) / np.sum(normals * near.tangent, axis=1)
+            new = problem.corrected(near.point + way[:, None] * near.tangent, normals, near.steps)
+            for column, part in zip(rows, new, strict=True):
+                column[going] = part
         measure = _measure(rows, problem.symmetry)
-        each = (entry[0].value(_some(rows, slice(j, j + 1)), measure[j : j + 1])[0] for j, entry in enumerate(found))
-        value = np.fromiter(each, np.float64, len(found))
-        if np.all((step < _LOCATED) | (value == 0)):
-            break
+        value[going] = [found[j][0].value(rows, measure)[j] for j in going]
         before = (value > 0) == positive
         # The weight of an end that stays for a second time is halved.
-        at_high = np.where(before, np.where(last < 0, 0.5 * at_high, at_high), value)
-        at_low = np.where(before, value, np.where(last > 0, 0.5 * at_low, at_low))
-        low, high, last = np.where(before, share, low), np.where(before, high, share), np.where(before, -1, 1)
+        after_high = np.where(before, np.where(last < 0, 0.5 * at_high, at_high), value)
+        after_low = np.where(before, value, np.where(last > 0, 0.5 * at_low, at_low))
+        for old, new_value in (
+            (at_high, after_high),
+            (at_low, after_low),
+            (low, np.where(before, share, low)),
+            (high, np.where(before, high, share)),
+            (last, np.where(before, -1.0, 1.0)),
+        ):
+            old[going] = new_value[going]
+        going = going[~((step < _LOCATED) | (value == 0))[going]]
+        if not going.size:
+            break
     return share, rows, value
 
 

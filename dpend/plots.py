@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from dpend.families import Family
 from dpend.orbits import PeriodicOrbit
 from dpend.pendulum import Pendulum, State, energies, positions
 from dpend.sweeps import unwritable
@@ -122,6 +123,50 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit]) -> "Figure":
         row[1].set_title(f"({np.degrees(orbit.theta1):.4f}, {np.degrees(orbit.theta2):.4f}) deg", fontsize="medium")
         row[2].set_title(f"T = {period:.6f} s, {orbit.stability}", fontsize="medium")
     return fig
+
+
+# The marks of a family's special points, by the beginning of their kind.
+_MARKS = {"resonance": "|", "fold": "^", "stability": "o"}
+
+
+def family(
+    curve: Family, ax: "Axes | None" = None, *, plane: str = "angles", colour: str = UPPER, label: str = ""
+) -> "Axes":
+    """A family of orbits: solid where they are stable (|kappa| <= 1), dashed where not, its special points marked.
+
+    Circles are where that changes, triangles folds, ticks resonances. A family whose releases lie to the left is drawn
+    in the mirror.
+
+    Arguments:
+        plane: `angles` for the releases (theta1, theta2) [deg], `period` for the period [s] against the energy [J].
+    Raises:
+        ValueError: another plane.
+    """
+    if plane not in ("angles", "period"):
+        raise ValueError(f"plane must be angles or period, got {plane!r}")
+    ax = _axes(ax)
+
+    side = np.sign(np.mean(curve.orbits.theta1))
+
+    def where(orbits: PeriodicOrbit) -> tuple[Any, Any]:
+        if plane == "angles":
+            return side * np.degrees(orbits.theta1), side * np.degrees(orbits.theta2)
+        return np.asarray(orbits.energy), np.asarray(orbits.period)
+
+    x, y = where(curve.orbits)
+    stable = np.asarray(curve.orbits.log_abs_kappa) <= 1e-9
+    # A piece between a stable and an unstable orbit is drawn as unstable, up to the point where that changes.
+    pieces = stable[:-1] & stable[1:]
+    ax.plot(x, y, color=colour, linestyle=(0, (4, 2)), linewidth=1.1)
+    solid = np.append(pieces, False) | np.append(False, pieces)
+    ax.plot(np.where(solid, x, np.nan), y, color=colour, linewidth=1.8, label=label or None)
+    for start, mark in _MARKS.items():
+        spots = [where(point.orbit) for point in curve.special_points if point.kind.startswith(start)]
+        if spots:
+            ax.plot(*np.transpose(spots), mark, color=colour, markerfacecolor="white", markersize=6, linestyle="none")
+    ax.set_xlabel("theta1 (deg)" if plane == "angles" else "energy (J)")
+    ax.set_ylabel("theta2 (deg)" if plane == "angles" else "period (s)")
+    return ax
 
 
 # What a map's colour bar says, and whether its values span decades.

@@ -140,19 +140,21 @@ def _equations(pendulum: Pendulum, point: Array, steps: Scalar, arc: Arc) -> _Eq
     s = _segments(pendulum, nodes, jnp.exp(point[_LOG_DELTA]), steps)
     by_node = s.matrix + s.slope[:, :, None] * s.stretch[:, None, :]
     by_delta = s.slope * s.time[:, None]
-    inner = np.arange(SEGMENTS - 1)[:, None] * 4 + np.arange(4)
-    value = jnp.zeros(UNKNOWNS - 1).at[inner].set(s.end[:-1] - nodes[1:])
-    jacobian = jnp.zeros((UNKNOWNS - 1, UNKNOWNS))
-    jacobian = jacobian.at[inner[:, :, None], inner[:, None, :]].set(by_node[:-1])
-    jacobian = jacobian.at[inner, inner + 4].set(-1.0)
-    jacobian = jacobian.at[inner, _LOG_DELTA].set(by_delta[:-1])
     ends, by_ends = _end_conditions(pendulum, nodes[0], s.end[-1], point[_UNFOLDING], arc)
-    last = slice(4 * SEGMENTS - 4, None)
-    value = value.at[last].set(ends)
-    jacobian = jacobian.at[last, 4 * SEGMENTS - 4 : _LOG_DELTA].set(by_ends[:, 4:8] @ by_node[-1])
-    jacobian = jacobian.at[last, _LOG_DELTA].set(by_ends[:, 4:8] @ by_delta[-1])
-    jacobian = jacobian.at[last, :4].add(by_ends[:, :4])
-    return _Equations(value, jacobian.at[last, _UNFOLDING].set(by_ends[:, 8]), s)
+    value = jnp.concatenate([(s.end[:-1] - nodes[1:]).ravel(), ends])
+    # Written without indexed updates, which XLA makes loops of.
+    inner = (by_node[:, :, None, :] * _DIAGONAL - _NEXT).reshape(4 * SEGMENTS, 4 * SEGMENTS)
+    gap = jnp.zeros((5, 4 * SEGMENTS - 8))
+    last = jnp.concatenate([by_ends[:, :4], gap, by_ends[:, 4:8] @ by_node[-1]], axis=1)
+    delta = jnp.append(by_delta[:-1].ravel(), by_ends[:, 4:8] @ by_delta[-1])
+    unfolding = jnp.append(jnp.zeros(4 * SEGMENTS - 4), by_ends[:, 8])
+    columns = jnp.concatenate([inner[:-4], last]), delta[:, None], unfolding[:, None]
+    return _Equations(value, jnp.concatenate(columns, axis=1), s)
+
+
+# Where blocks (i, i) and (i, i + 1) of the Jacobian are.
+_DIAGONAL = np.eye(SEGMENTS)[:, None, :, None]
+_NEXT = np.einsum("ij,ab->iajb", np.eye(SEGMENTS, k=1), np.eye(4))
 
 
 def _end_conditions(pendulum: Pendulum, start: Array, end: Array, unfolding: Scalar, arc: Arc) -> tuple[Array, Array]:

@@ -153,9 +153,9 @@ def explicit_step(
     weights = jnp.asarray(_square(tableau))
 
     def stage(index: Scalar, slopes: jax.Array) -> jax.Array:
-        row = weights[index]
+        row = lax.dynamic_index_in_dim(weights, index, keepdims=False)  # `.at` and [] would check the index
         here = sum((row[j] * slopes[j] for j in range(stages - 1)), start=start)
-        return slopes.at[index].set(rows(increment(tree(here))))
+        return lax.dynamic_update_index_in_dim(slopes, rows(increment(tree(here))), index, 0)
 
     slopes_table = lax.fori_loop(0, stages, stage, jnp.zeros((stages, *start.shape)))
     return tree(sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=start))

@@ -92,8 +92,8 @@ def test_reference_values_and_special_points(families, branch):
 
 @pytest.mark.parametrize("branch", BOTH)
 def test_both_ends(unit, families, branch):
-    """At zero amplitude the normal mode; at the other end the upright pendulum and the law T = const - (2/lambda) ln gap
-    with the slow exponent lambda = sqrt(2 - sqrt 2) of its equilibrium.
+    """At zero amplitude the normal mode; at the other end the upright pendulum, and T = const - (2/lambda) ln gap with
+    the slow exponent lambda = sqrt(2 - sqrt 2) of its equilibrium.
     """
     family, slow = families[branch], branch == "in-phase"
     mode = dpend.normal_modes(unit)[0 if slow else 1]
@@ -242,7 +242,7 @@ def test_orbits_of_twice_and_three_times_the_period(unit, families):
     )
     for family, k in ((doubled, 2), (tripled, 3)):
         orbit = single(family.orbits, 5)
-        assert np.all(orbit.state.p1 == 0) and np.all(orbit.state.p2 == 0)
+        np.testing.assert_array_equal([orbit.state.p1, orbit.state.p2], 0)
         states = motion(orbit)
         np.testing.assert_allclose(states[:, 29], [orbit.dual.theta1, orbit.dual.theta2, 0, 0], atol=1e-8)
         covered = states[:2, 60 // k - 1] - [orbit.theta1, orbit.theta2]
@@ -250,8 +250,8 @@ def test_orbits_of_twice_and_three_times_the_period(unit, families):
 
 
 def test_a_family_from_one_of_its_orbits(paper):
-    """In both directions: the same curve as from the mode; and the brake orbit at (40, 119.49) deg belongs to the orbits
-    of twice the period that leave the anti-phase family where its c = 0.
+    """In both directions: the same curve as from the mode; and the brake orbit at (40, 119.49) deg belongs to those of
+    twice the period that leave the anti-phase family where its c = 0.
     """
     whole = dpend.follow_family(paper, "anti-phase")
     again = dpend.follow_family(paper, whole.at(0.9))
@@ -305,7 +305,7 @@ def test_families_of_other_pendulums(lengths, masses, branch):
     slope = np.polyfit(np.log(gap[late]), orbits.period[late], 1)[0]
     slowest = np.min(np.abs(dpend.equilibria(pendulum).exponents[3].real))
     passages = -slope * slowest / 2
-    assert abs(passages - round(passages)) < 0.02 and round(passages) >= 1
+    assert abs(passages - max(round(passages), 1)) < 0.02
     # Four points against diffrax: at the centre after a quarter of the period.
     for i in np.linspace(0, len(gap) - 1, 30).astype(int)[[1, 5, 9, 13]]:
         orbit = single(orbits, i)
