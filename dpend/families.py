@@ -16,38 +16,36 @@ import numpy as np
 from jax import lax
 
 from dpend._runtime import require_float64
+from dpend.continuation import (
+    LARGEST_COVER,
+    Curve,
+    Problem,
+    begun,
+    curve_of,
+    joined,
+    laid_out,
+    repeated,
+    some_of,
+    turned,
+    way_to,
+)
 from dpend.orbits import BRANCHES, PeriodicOrbit
-from dpend.pendulum import Pendulum, Scalar, State, equilibria, hamiltonian, number
+from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
 from dpend.shooting import (
-    CHUNK,
     FIRST_STEP,
     METRIC,
-    NEARLY,
     PARTS,
-    SEGMENTS,
-    SYMMETRIES,
-    UNKNOWNS,
-    Arc,
     Corrected,
-    Tasks,
-    Walk,
     beginning,
-    hermite,
-    laid,
-    linearised,
     natural,
     sensitivities,
     stability_of,
-    unpacked,
-    walk,
 )
 from dpend.trajectory import Status, known_value
 
 # The longest step: a hundred points or so for a family, close enough for cubics to show every turn.
 _LONGEST_STEP = 0.1
 _MOST_POINTS = 5000
-# Resonances k:n are told up to this k.
-_LARGEST_COVER = 6
 
 
 class Slopes(NamedTuple):
@@ -65,10 +63,11 @@ class Slopes(NamedTuple):
     energy: Scalar
 
 
-class _Place(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Place:
     """A point of a curve, and what it solves."""
 
-    problem: "_Problem"
+    problem: "Problem"
     rows: Corrected  # of one row
 
 
@@ -120,8 +119,8 @@ class Family:
     special_points: tuple[SpecialPoint, ...]
     status: Scalar
     ends: tuple[str, str] = field(metadata={"static": True})
-    _curve: "_Curve" = field(repr=False, metadata={"static": True})
-    _problem: "_Problem" = field(repr=False)
+    _curve: "Curve" = field(repr=False, metadata={"static": True})
+    _problem: "Problem" = field(repr=False)
 
     @property
     def symmetry(self) -> str:
@@ -160,225 +159,6 @@ _MESSAGES = {
     "goes on.",
     Status.MAX_ITERATIONS: "It has more points than were allowed: raise most_points.",
 }
-
-
-# --- curves ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Curve:
-    """Points of a curve with unit tangents; of a family that begins in a normal mode, the mode itself is the first."""
-
-    points: np.ndarray
-    tangents: np.ndarray
-    steps: np.ndarray
-
-    @property
-    def lengths(self) -> np.ndarray:
-        ways = np.diff(self.points, axis=0)
-        return np.sqrt(np.sum(METRIC * ways**2, axis=1))
-
-    def between(self, index: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Points at shares of the intervals `index`, by cubics."""
-        start, end = self.points[index].T, self.points[index + 1].T
-        slope, end_slope = self.tangents[index].T, self.tangents[index + 1].T
-        return np.asarray(hermite(start, slope, end, end_slope, self.lengths[index], share)).T
-
-    def tangents_between(self, index: np.ndarray, share: np.ndarray) -> np.ndarray:
-        mixed = (1 - share)[:, None] * self.tangents[index] + share[:, None] * self.tangents[index + 1]
-        return mixed / np.sqrt(np.sum(METRIC * mixed**2, axis=1))[:, None]
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class _Problem:
-    """What is followed: the pendulum as it was given, which may carry derivatives, and the same in natural units."""
-
-    pendulum: Pendulum
-    natural: Pendulum = field(metadata={"static": True})
-    symmetry: str = field(metadata={"static": True})
-    turns: tuple[float, float] = field(metadata={"static": True})
-
-    @property
-    def arc(self) -> Arc:
-        return Arc(np.asarray(SYMMETRIES.index(self.symmetry)), np.asarray(self.turns))
-
-    def corrected(self, points: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> Corrected:
-        """The points of the family in the planes through `points` that `rows` are normal to."""
-        tables = []
-        for first in range(0, len(points), CHUNK):
-            some = slice(first, first + CHUNK)
-            count = len(points[some])
-            tasks = Tasks(_padded(points[some]), _padded(rows[some]), _padded(steps[some]).astype(int), np.int64(count))
-            _, table, _, _ = walk(self.natural, _begun(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc)
-            tables.append(np.asarray(table)[:count])
-        return unpacked(np.concatenate(tables))
-
-    def followed(self, start: Walk, origin: Corrected | None, longest: Scalar, most: int) -> tuple[Corrected, str]:
-        """The points after `start`, and what the family's end is; `origin` is the place it could come back to."""
-        nothing = np.zeros((CHUNK, UNKNOWNS))
-        tasks = Tasks(nothing, nothing, nothing[:, 0].astype(int), np.int64(0))
-        tables: list[np.ndarray] = []
-        count, end = 0, ""
-        while not end and count < most:
-            start, table, more, status = walk(self.natural, start, longest, tasks, self.arc)
-            tables.append(np.asarray(table)[: int(more)])
-            rows, count = unpacked(np.concatenate(tables)), count + int(more)
-            end = ("", "ended", "lost")[int(status)]
-            if end == "lost" and len(rows.point) and self._near_limit(rows):
-                end = "ended"
-            back = None if origin is None else self._back(origin, rows, count - int(more))
-            if back is not None:
-                return _cut(rows, back)
-        if count > most:
-            return _some(rows, slice(most)), "unfinished"
-        if end == "ended":
-            end = "normal mode" if rows.energy[-1] < -0.9 * self.weights else "homoclinic"
-        return rows, end or "unfinished"
-
-    def on_curve(self, point: np.ndarray) -> Corrected | None:
-        """The point of the family near one that is nearly on it, its tangent not known; None if there is none."""
-        row, steps = np.zeros(UNKNOWNS), np.array([_MANY_STEPS])
-        row[[0, 1, -2]] = 0.6, 0.4, 1.0  # crosses any curve but by accident
-        for _ in range(3):
-            rows = self.corrected(point[None], row[None], steps)
-            if not rows.converged[0]:
-                return None
-            point, row, steps = rows.point[0], METRIC * rows.tangent[0], rows.steps
-        return rows
-
-    def onto_branch(self, base: Corrected, point: np.ndarray, sign: float) -> Corrected | None:
-        """The first point of a branch that leaves the family of `base`, from that orbit's own point on this problem;
-        None if nothing is met.
-        """
-        for _ in range(3):  # onto the orbit, by the shortest ways: the equations have rank two less than unknowns here
-            value, jacobian = (np.asarray(x) for x in linearised(self.natural, point, _MANY_STEPS, self.arc))
-            point = point - np.linalg.pinv(jacobian, rcond=_NO_RANK) @ value
-        _, sizes, directions = np.linalg.svd(jacobian)
-        if sizes[-1] > _NO_RANK * sizes[0]:
-            return None
-        kernel = directions[-2:] / np.sqrt(np.sum(METRIC * directions[-2:] ** 2, axis=1))[:, None]
-        old = np.append(base.tangent[0, :4], 0.0)
-        # The family's own direction is the one whose first node moves as the family's does.
-        mix = np.linalg.lstsq(np.column_stack([kernel[:, :4].T]), old[:4], rcond=None)[0]
-        own = mix @ kernel
-        own /= np.sqrt(own @ (METRIC * own))
-        new = kernel[np.argmin(np.abs(kernel @ (METRIC * own)))]
-        new = new - (new @ (METRIC * own)) * own
-        new *= np.sign(new[np.argmax(np.abs(new))]) / np.sqrt(new @ (METRIC * new))
-        new *= sign
-        for size in _ONTO_BRANCH:
-            steps = np.array([_MANY_STEPS])
-            for _ in range(2):
-                rows = self.corrected((point + size * new)[None], (METRIC * new)[None], steps)
-                steps = rows.steps
-            strayed = rows.point[0] - point - size * new
-            if rows.converged[0] and np.sqrt(strayed @ (METRIC * strayed)) < 0.5 * abs(size):
-                return rows
-        return None
-
-    @property
-    def weights(self) -> float:
-        """The largest potential energy, that of the upright pendulum, in natural units."""
-        return float(1 + self.natural.m2 * (1 + self.natural.l2))
-
-    def _near_limit(self, rows: Corrected) -> bool:
-        """Whether a family was lost where rounding, magnified by the inverse distance, keeps it from its end."""
-        levels = np.asarray(equilibria(self.natural).energy)[1:]
-        gap = np.min(np.abs(rows.energy[-1] - levels)) / self.weights
-        return bool(gap < NEARLY and abs(rows.energy_slope[-1]) < 1e3 * NEARLY * self.weights)
-
-    def _back(self, origin: Corrected, rows: Corrected, since: int) -> int | None:
-        """How many points it takes the curve to come back to `origin`, an orbit that it may meet at its other rest."""
-        curve = _curve_of(rows)
-        own = _reduced(origin)[0]
-        other = origin.end[0, :2] if self.symmetry == "brake" else 2 * np.pi * np.asarray(self.turns) - own[:2]
-        where = _reduced(rows)
-        for i in range(max(since - 1, _LEAVING), len(where) - 1):
-            chord = where[i + 1] - where[i]
-            for release in (own, np.append(other, own[2])):
-                apart = _apart(where[i], release)
-                share = apart @ chord / (chord @ chord)
-                near = np.linalg.norm(apart - share * chord) < 0.1 * np.linalg.norm(chord)
-                if -0.1 < share < 1.1 and near and self._meets(curve, i, share, release):
-                    return i + 1
-        return None
-
-    def _meets(self, curve: "_Curve", i: int, share: float, release: np.ndarray) -> bool:
-        """Whether the curve goes through the release, looked at on the curve itself."""
-        for _ in range(4):
-            index, shares = np.array([i]), np.array([share])
-            tangent = curve.tangents_between(index, shares)
-            rows = self.corrected(curve.between(index, shares), METRIC * tangent, curve.steps[index + 1])
-            apart = _apart(_reduced(rows)[0], release)
-            slope = np.append(rows.tangent[0, :2], rows.time_slope[0] / rows.times[0].sum())
-            share += float(apart @ slope / (slope @ slope) / curve.lengths[i])
-        return bool(np.linalg.norm(apart) < _SAME_PLACE)
-
-
-# Points at the beginning that are not looked at for a return; and what counts as one [rad, and log of the time].
-_LEAVING, _SAME_PLACE = 4, 1e-7
-
-
-def _cut(rows: Corrected, count: int) -> tuple[Corrected, str]:
-    """A curve that has come back after `count` points: closed, unless it only turned round at a branch point.
-
-    Where it meets a more symmetric family, a curve goes on through the same orbits, met at their other rests, as often
-    as it took to get there.
-    """
-    rows = _some(rows, slice(count))
-    lengths = np.cumsum(_curve_of(rows).lengths)
-    (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
-    half = [i for i in crossings if abs(lengths[i] - 0.5 * lengths[-1]) < _MIDDLE * lengths[-1]]
-    return (_some(rows, slice(half[0] + 1)), "branch point") if half else (rows, "closed")
-
-
-# How far from the middle of its way a curve may have turned round, as a share of it.
-_MIDDLE = 0.1
-
-
-def _reduced(rows: Corrected) -> np.ndarray:
-    """(theta1, theta2, log of the time), which tell orbits of one symmetry apart."""
-    return np.concatenate([rows.point[:, :2], np.log(rows.times.sum(axis=1))[:, None]], axis=1)
-
-
-def _apart(where: np.ndarray, release: np.ndarray) -> np.ndarray:
-    """From one to the other, angles modulo 2 pi."""
-    way = release - where
-    way[:2] -= 2 * np.pi * np.round(way[:2] / (2 * np.pi))
-    return way
-
-
-def _begun(point: np.ndarray, tangent: np.ndarray, step: Scalar, steps: Scalar) -> Walk:
-    # Always of these types: compiled code is keyed by them.
-    length, size, side = np.array([0.0, step, 0.0])
-    count, leap = np.array([steps, 0]).astype(int)
-    return Walk(point, tangent, point, tangent, length, size, side, count, tangent, leap)
-
-
-def _padded(array: np.ndarray) -> np.ndarray:
-    missing = CHUNK - len(array)
-    return np.concatenate([array, np.repeat(array[:1], missing, axis=0)])
-
-
-def _some(rows: Corrected, which: Any) -> Corrected:
-    return Corrected(*(column[which] for column in rows))
-
-
-def _joined(*parts: Corrected) -> Corrected:
-    return Corrected(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-
-def _turned(rows: Corrected) -> Corrected:
-    """The same points, met in the opposite order."""
-    back = _some(rows, slice(None, None, -1))
-    return back._replace(
-        tangent=-back.tangent, time_slope=-back.time_slope, energy_slope=-back.energy_slope, side=-back.side
-    )
-
-
-def _curve_of(rows: Corrected) -> _Curve:
-    return _Curve(rows.point, rows.tangent, rows.steps)
 
 
 # --- from points to orbits -------------------------------------------------------------------------------------------
@@ -450,7 +230,7 @@ def _in_units(pendulum: Pendulum, known: _Known, turns: Any, symmetry: str, xp: 
     }
 
 
-def _orbits(problem: _Problem, rows: Corrected, targets: Any = None, along: Any = None) -> PeriodicOrbit:
+def _orbits(problem: Problem, rows: Corrected, targets: Any = None, along: Any = None) -> PeriodicOrbit:
     """Points as orbits, in NumPy: eager JAX would compile each operation for each number of points.
 
     With `targets`, the values of theta1 at which the rows `along` were solved, everything carries derivatives.
@@ -480,7 +260,7 @@ def _orbits(problem: _Problem, rows: Corrected, targets: Any = None, along: Any 
     )
 
 
-def _slopes(problem: _Problem, rows: Corrected) -> Slopes:
+def _slopes(problem: Problem, rows: Corrected) -> Slopes:
     pendulum = jax.tree.map(known_value, problem.pendulum)
     second = math.sqrt(pendulum.l1 / pendulum.g)
     return Slopes(
@@ -550,7 +330,7 @@ def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
 _STRAYED = 0.1
 
 
-def _passages(curve: _Curve, targets: np.ndarray, crossing: int) -> tuple[np.ndarray, np.ndarray]:
+def _passages(curve: Curve, targets: np.ndarray, crossing: int) -> tuple[np.ndarray, np.ndarray]:
     """The interval (-1 where there is none) and the share of it at which |theta1| meets each target."""
     pieces = np.arange(_PIECES) / _PIECES
     index = np.repeat(np.arange(len(curve.points) - 1), _PIECES)
@@ -597,7 +377,7 @@ def _tests(symmetry: str) -> list[_Test]:
     branches = {"centred": (("odd", 1), ("brake", 1)), "brake": (None, ("brake", 2)), "odd": (None, None)}[symmetry]
     tests.append(_Test("above", lambda rows, c: c - 1, branches[0]))
     tests.append(_Test("below", lambda rows, c: c + 1, branches[1]))
-    for k in range(2, _LARGEST_COVER + 1):
+    for k in range(2, LARGEST_COVER + 1):
         for n in range(1, k):
             if math.gcd(n, k) > 1 or (symmetry == "brake" and 2 * n > k):
                 continue
@@ -619,7 +399,7 @@ _LOCATED, _MET = 1e-12, 1e-6
 _ROUNDS = 60
 
 
-def _special_points(problem: _Problem, rows: Corrected, curve: _Curve, arclength: np.ndarray) -> list[SpecialPoint]:
+def _special_points(problem: Problem, rows: Corrected, curve: Curve, arclength: np.ndarray) -> list[SpecialPoint]:
     """Every place between two points where a test changes sign.
 
     Located by Newton's method on the family's equations together with the test's: each point is corrected onto the
@@ -640,25 +420,24 @@ def _special_points(problem: _Problem, rows: Corrected, curve: _Curve, arclength
         for j, (test, _, before, _) in enumerate(found):
             if abs(values[j]) > _MET:
                 continue  # c changes from one huge value to another in less than a step can resolve
-            place = _some(located, slice(j, j + 1))
+            place = some_of(located, slice(j, j + 1))
             kind = test.kind
             if kind in ("above", "below"):  # the bound of the stable range: is it left?
                 kind = "stability_lost" if (before < 0) == (kind == "above") else "stability_gained"
             where = arclength[index[j]] + shares[j] * (arclength[index[j] + 1] - arclength[index[j]])
-            branch = test.branch
-            points.append(_special(problem, place, where, kind, branch))
+            points.append(_special(problem, place, where, kind, test.branch))
     for i in crossings:
-        points.append(_special(problem, _some(rows, slice(i, i + 1)), arclength[i + offset], "crossing", None))
+        points.append(_special(problem, some_of(rows, slice(i, i + 1)), arclength[i + offset], "crossing", None))
     return sorted(points, key=lambda point: float(point.arclength))
 
 
-def _special(problem: _Problem, place: Corrected, where: Scalar, kind: str, branch: Any) -> SpecialPoint:
+def _special(problem: Problem, place: Corrected, where: Scalar, kind: str, branch: Any) -> SpecialPoint:
     both = _orbits(problem, place), _slopes(problem, place)
     orbit, slopes = jax.tree.map(lambda leaf: leaf[0], both)
     return SpecialPoint(where, orbit, slopes, kind, _Place(problem, place), branch)
 
 
-def _roots(problem: _Problem, curve: _Curve, found: list, index: np.ndarray) -> tuple:
+def _roots(problem: Problem, curve: Curve, found: list, index: np.ndarray) -> tuple:
     """Shares of the intervals `index` at which the tests vanish, the rows there, and the tests' values."""
     low, high = np.zeros(len(found)), np.ones(len(found))
     at_low, at_high = (np.array([entry[k] for entry in found]) for k in (2, 3))
@@ -677,7 +456,7 @@ def _roots(problem: _Problem, curve: _Curve, found: list, index: np.ndarray) -> 
         if rows is None:
             rows = problem.corrected(points, normals, curve.steps[index + 1])
         else:  # from the last one, along its tangent into the new plane
-            near = _some(rows, going)
+            near = some_of(rows, going)
             way = np.sum(normals * (points - near.point), axis=1) / np.sum(normals * near.tangent, axis=1)
             new = problem.corrected(near.point + way[:, None] * near.tangent, normals, near.steps)
             for column, part in zip(rows, new, strict=True):
@@ -741,11 +520,11 @@ def follow_family(
     longest = np.float64(number("longest_step", longest_step, positive=True))
     if not isinstance(most_points, int) or most_points < 2:
         raise ValueError(f"most_points must be an integer of at least 2, got {most_points!r}")
-    scaled = jax.tree.map(np.asarray, natural(fixed))
+    scaled = jax.tree.map(np.float64, natural(fixed))
     if isinstance(start, str):
         if start not in BRANCHES:
             raise ValueError(f"start must be one of {', '.join(BRANCHES)}, or an orbit, got {start!r}")
-        return _from_mode(_Problem(pendulum, scaled, "centred", (0.0, 0.0)), start, longest, most_points)
+        return _from_mode(Problem(pendulum, scaled, "centred", (0.0, 0.0)), start, longest, most_points)
     if isinstance(start, SpecialPoint):
         return _from_branch_point(pendulum, start, longest, most_points)
     return _from_orbit(pendulum, scaled, start, longest, most_points)
@@ -766,12 +545,12 @@ def _known(pendulum: Pendulum) -> Pendulum:
 _beginning = jax.jit(beginning)
 
 
-def _from_mode(problem: _Problem, branch: str, longest: Scalar, most: int) -> Family:
+def _from_mode(problem: Problem, branch: str, longest: Scalar, most: int) -> Family:
     start = jax.tree.map(np.asarray, _beginning(problem.natural, branch == "in-phase"))
     rows, end = problem.followed(start, None, longest, most)
-    curve = _curve_of(rows)
+    curve = curve_of(rows)
     points, tangents = np.vstack([start.point, curve.points]), np.vstack([start.tangent, curve.tangents])
-    curve = _Curve(points, tangents, np.append(start.steps, curve.steps))
+    curve = Curve(points, tangents, np.append(start.steps, curve.steps))
     return _family(problem, rows, curve, ("normal mode", end))
 
 
@@ -794,11 +573,11 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, long
     turns = {"centred": np.array(orbit.turns, np.float64), "odd": np.round((state + dual)[:2] / (2 * np.pi))}
     symmetry = orbit.symmetry
     full = turns.get(symmetry, np.zeros(2))
-    problem = _Problem(pendulum, scaled, symmetry, (float(full[0]), float(full[1])))
+    problem = Problem(pendulum, scaled, symmetry, (float(full[0]), float(full[1])))
     duration = float(orbit.period) / second / PARTS[symmetry]
-    point = _laid_out(problem, np.zeros(1), state[None], duration)
+    point = laid_out(problem, np.zeros(1), state[None], duration)
     rows = problem.on_curve(point)
-    if rows is None or np.linalg.norm(_apart(rows.point[0, :2], state[:2])) > _SAME_ORBIT:
+    if rows is None or np.linalg.norm(way_to(rows.point[0, :2], state[:2])) > _SAME_ORBIT:
         raise ValueError("start must be an orbit whose motion is still known at the end of its arc: give another one")
     return _both_ways(problem, rows, longest, most)
 
@@ -807,28 +586,28 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, long
 _SAME_ORBIT = 1e-5
 
 
-def _both_ways(problem: _Problem, rows: Corrected, longest: Scalar, most: int) -> Family:
+def _both_ways(problem: Problem, rows: Corrected, longest: Scalar, most: int) -> Family:
     """The family through a point, in both directions unless it is closed."""
     first = min(FIRST_STEP, longest)
-    start = _begun(rows.point[0], rows.tangent[0], first, rows.steps[0])
+    start = begun(rows.point[0], rows.tangent[0], first, rows.steps[0])
     ahead, end = problem.followed(start, rows, longest, most)
     if end == "closed":
         return _closed(problem, rows, ahead)
     behind, begin = problem.followed(start._replace(tangent=-start.tangent), rows, longest, most)
-    rows = _joined(_turned(behind), rows, ahead)
-    return _family(problem, rows, _curve_of(rows), (begin, end))
+    rows = joined(turned(behind), rows, ahead)
+    return _family(problem, rows, curve_of(rows), (begin, end))
 
 
-def _closed(problem: _Problem, start: Corrected, ahead: Corrected) -> Family:
+def _closed(problem: Problem, start: Corrected, ahead: Corrected) -> Family:
     """A curve that comes back to its beginning: to the same rest, which is then its last point too, or to the other."""
-    rows = _joined(start, ahead)
+    rows = joined(start, ahead)
     gap = np.sqrt(np.sum(METRIC * (ahead.point[-1] - start.point[0]) ** 2))
-    if gap < 2 * _curve_of(rows).lengths[-1]:
-        rows = _joined(rows, start)
-    return _family(problem, rows, _curve_of(rows), ("closed", "closed"))
+    if gap < 2 * curve_of(rows).lengths[-1]:
+        rows = joined(rows, start)
+    return _family(problem, rows, curve_of(rows), ("closed", "closed"))
 
 
-def _family(problem: _Problem, rows: Corrected, curve: _Curve, ends: tuple[str, str]) -> Family:
+def _family(problem: Problem, rows: Corrected, curve: Curve, ends: tuple[str, str]) -> Family:
     arclength = np.concatenate([[0.0], np.cumsum(curve.lengths)])
     points = _special_points(problem, rows, curve, arclength)
     status = Status.CONVERGED
@@ -848,54 +627,8 @@ def _family(problem: _Problem, rows: Corrected, curve: _Curve, ends: tuple[str, 
     )
 
 
-def _laid_out(problem: _Problem, times: np.ndarray, states: np.ndarray, duration: float) -> np.ndarray:
-    """A point to be corrected for an arc of `duration` on an orbit of which some states are known."""
-    missing = _KNOWN - len(times)
-    times = np.append(times, np.full(missing, np.inf))
-    states = np.vstack([states, np.zeros((missing, 4))])
-    return np.asarray(laid(problem.natural, times, states, duration))
-
-
-# Room for the known states of six periods of a centred orbit, so that the laying of arcs compiles once.
-_KNOWN = 4 * SEGMENTS * _LARGEST_COVER
-
-
-def _unrolled(place: _Place) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states known on half a period of an orbit: its nodes and, if it is centred, their images about T/4."""
-    rows, problem = place.rows, place.problem
-    states = rows.point[0, : 4 * SEGMENTS].reshape(SEGMENTS, 4)
-    times = np.concatenate([[0.0], np.cumsum(rows.times[0])])
-    if problem.symmetry != "centred":
-        return times[:-1], states
-    images = states[:0:-1] * [-1, -1, 1, 1] + 2 * np.pi * np.append(problem.turns, [0, 0])
-    centre = rows.end[0]
-    return np.append(times, 2 * times[-1] - times[-2:0:-1]), np.vstack([states, centre, images])
-
-
-def _repeated(place: _Place, halves: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same on so many halves of the period."""
-    times, states = _unrolled(place)
-    half = place.rows.times[0].sum() * PARTS[place.problem.symmetry] / 2
-    all_times, all_states = [times], [states]
-    for i in range(1, halves):
-        if place.problem.symmetry == "brake":
-            # Each rest reflects time: the second half is the first, backwards, with the momenta turned round.
-            back = np.append(half, times[:0:-1]), np.vstack([place.rows.end[0], states[:0:-1]]) * [1, 1, -1, -1]
-            later = (half - back[0], back[1]) if i % 2 else (times, states)
-        else:
-            turned = 2 * np.pi * np.append(place.problem.turns, [0, 0]) - states
-            later = (times, turned if i % 2 else states)
-        all_times.append(i * half + later[0])
-        all_states.append(later[1])
-    return np.concatenate(all_times), np.concatenate(all_states)
-
-
-# Steps in a segment where none were counted yet.
-_MANY_STEPS = 40
-# Singular values below this share of the largest are zero.
-_NO_RANK = 1e-3
-# How far along the new direction the branch is looked for.
-_ONTO_BRANCH = (0.02, 0.005, 0.05, 0.001)
+# At a fold in energy stability changes, too, and no other family is there: slopes below this are zero.
+_FLAT = 1e-5
 
 
 def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: Scalar, most: int) -> Family:
@@ -903,13 +636,13 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: Scala
         raise ValueError(f"start must be a point where a family branches off, got {special.kind}: follow its orbit")
     symmetry, k = special._branch
     base = special._place
-    if special.kind.startswith("stability") and abs(float(base.rows.energy_slope[0])) < _AT_FOLD:
+    if special.kind.startswith("stability") and abs(float(base.rows.energy_slope[0])) < _FLAT:
         raise ValueError(f"start must be a point where a family branches off, got {special.kind} at a fold in energy")
     half = float(base.rows.times[0].sum()) * PARTS[base.problem.symmetry] / 2
     duration = k * half * 2 / PARTS[symmetry]
     turns = base.problem.turns if symmetry != "brake" else (0.0, 0.0)
-    problem = _Problem(pendulum, base.problem.natural, symmetry, turns)
-    point = _laid_out(problem, *_repeated(base, k), duration)
+    problem = Problem(pendulum, base.problem.natural, symmetry, turns)
+    point = laid_out(problem, *repeated(base.problem, base.rows, k), duration)
     sides = []
     for sign in (1.0, -1.0):
         rows = problem.onto_branch(base.rows, point, sign)
@@ -917,15 +650,15 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: Scala
             raise ValueError(
                 f"start must be a point where a family branches off, got {special.kind} without one nearby"
             )
-        start = _begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, longest), rows.steps[0])
+        start = begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, longest), rows.steps[0])
         ahead, end = problem.followed(start, rows, longest, most)
         if end == "closed":
             return _closed(problem, rows, ahead)
-        sides.append((_joined(rows, ahead), end))
+        sides.append((joined(rows, ahead), end))
         if symmetry != "centred":
             break  # the other side holds the same orbits, at their other rest or in the mirror
     (one, end), other = sides[0], sides[1:]
     if other:
-        rows = _joined(_turned(other[0][0]), one)
-        return _family(problem, rows, _curve_of(rows), (other[0][1], end))
-    return _family(problem, one, _curve_of(one), ("branch point", end))
+        rows = joined(turned(other[0][0]), one)
+        return _family(problem, rows, curve_of(rows), (other[0][1], end))
+    return _family(problem, one, curve_of(one), ("branch point", end))

@@ -278,3 +278,30 @@ def test_the_program_itself(tmp_path):
     assert refused.returncode == 2
     assert refused.stderr.startswith("dpend: theta1 must be a finite number")
     assert refused.stderr.count("\n") == 1
+
+
+def test_a_family_as_json_and_csv(capsys, tmp_path):
+    status, found = run_json(capsys, "family", "--branch", "anti-phase")
+    assert (status, found["status"], found["ends"]) == (0, "converged", ["normal mode", "homoclinic"])
+    assert found["points"][0].keys() >= set("theta1_deg theta2_deg period_s energy_J kappa symmetry".split())
+    assert {point["symmetry"] for point in found["points"]} == {"centred"}
+    lost = found["bifurcations"][-1]
+    assert lost["kind"] == "stability_lost"
+    # 0.9890865027 rad and 6.1475153497 sqrt(l/g).
+    assert abs(lost["theta1_deg"] - np.degrees(0.9890865027)) < 1e-8
+    assert abs(lost["period_s"] - 6.1475153497 * np.sqrt(0.2 / 9.8)) < 1e-10
+    out = tmp_path / "f.csv"
+    status, text, err = run(capsys, "family", "--branch", "anti-phase", "--out", out)
+    assert (status, err) == (0, "")
+    assert "stability_lost" in text
+    table = np.genfromtxt(out, delimiter=",", names=True, usecols=range(9))
+    np.testing.assert_allclose(table["theta2_deg"], [point["theta2_deg"] for point in found["points"]], rtol=1e-15)
+    run(capsys, "family", "--branch", "anti-phase", "--out", tmp_path / "f.json")
+    assert json.loads((tmp_path / "f.json").read_text()) == found
+    for bad in (
+        ("--branch", "sideways"),
+        ("--branch", "in-phase", "--out", "f.txt"),
+        ("--branch", "in-phase", "--g", 0),
+    ):
+        status, text, err = run(capsys, "family", *bad)
+        assert (status, text, err.count("\n")) == (2, "", 1)

@@ -72,3 +72,19 @@ def test_a_map_shows_its_cells_and_the_line_no_flip_crosses(paper):
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("theta1 (deg)", "theta2 (deg)")
     with pytest.raises(ValueError, match="name must be one of bob, flip_time, steps, status, got 'flips'"):
         plots.map_of(field, "flips")
+
+
+def test_a_family_is_solid_where_it_is_stable(paper):
+    """The solid line ends at the last stable orbit before stability is lost, and every special point has its mark."""
+    family = dpend.follow_family(paper, "anti-phase")
+    ax = plots.family(family, plane="period")
+    whole, solid, *marks = ax.lines
+    assert len(whole.get_xdata()) == len(family.arclength)
+    lost = family.special_points[-1].orbit.energy
+    energies = np.asarray(solid.get_xdata())
+    reach = np.nanmax(energies)
+    assert reach < lost
+    assert np.sum((family.orbits.energy > reach) & (family.orbits.energy < lost)) == 0
+    assert sum(len(mark.get_xdata()) for mark in marks) == len(family.special_points)
+    with pytest.raises(ValueError, match="plane must be angles or period"):
+        plots.family(family, plane="momenta")
