@@ -36,8 +36,8 @@ LARGEST_COVER = 6
 _MANY_STEPS = 40
 # Singular values below this share of the largest are zero.
 _NO_RANK = 1e-3
-# How far along the new direction the branch is looked for.
-_ONTO_BRANCH = (0.02, 0.005, 0.05, 0.001)
+# How far along the new direction the branch is looked for, and how much further to its side it may be.
+_ONTO_BRANCH, _ASTRAY = (0.02, 0.005, 0.05, 0.001), 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class Problem:
         if count > most:
             return some_of(rows, slice(most)), "unfinished"
         if end == "ended":
-            end = "normal mode" if rows.energy[-1] < -0.9 * self.weights else "homoclinic"
+            end = "homoclinic" if self._slows(rows) else "normal mode"
         return rows, end or "unfinished"
 
     def on_curve(self, point: np.ndarray) -> Corrected | None:
@@ -146,7 +146,7 @@ class Problem:
                 rows = self.corrected((point + size * new)[None], (METRIC * new)[None], steps)
                 steps = rows.steps
             strayed = rows.point[0] - point - size * new
-            if rows.converged[0] and np.sqrt(strayed @ (METRIC * strayed)) < 0.5 * abs(size):
+            if rows.converged[0] and np.sqrt(strayed @ (METRIC * strayed)) < _ASTRAY * size:
                 return rows
         return None
 
@@ -154,6 +154,11 @@ class Problem:
     def weights(self) -> float:
         """The largest potential energy, that of the upright pendulum, in natural units."""
         return float(1 + self.natural.m2 * (1 + self.natural.l2))
+
+    def _slows(self, rows: Corrected) -> bool:
+        """Whether the time at the end grows like the logarithm of the distance from an equilibrium's energy."""
+        gap = np.min(np.abs(rows.energy[-1] - np.asarray(equilibria(self.natural).energy)))
+        return bool(abs(rows.time_slope[-1]) * gap > 1e-3 * abs(rows.energy_slope[-1]))
 
     def _near_limit(self, rows: Corrected) -> bool:
         """Whether a family was lost where rounding, magnified by the inverse distance, keeps it from its end."""

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import jax
@@ -80,7 +81,7 @@ class SpecialPoint:
         kind: `stability_lost` or `stability_gained` on the way along the family; `fold_theta1`, `fold_energy`, where
             the curve turns back in it; `resonance_k:n`, where the multipliers are exp(+-2 pi i n/k) and orbits of k
             times the period branch off; `crossing`, where another curve runs through this one, or passes it by less
-            than 2e-4.
+            than 2e-4, to which it is known then.
         arclength: where, in the family's.
         orbit: the orbit there.
         slopes: derivatives with respect to arclength.
@@ -108,9 +109,9 @@ class Family:
         special_points: in order of arclength.
         status: `Status.CONVERGED` if the family was followed to its ends, `LEFT_BRANCH` if at one no step was short
             enough, `MAX_ITERATIONS` if it has more points than were allowed.
-        ends: what its beginning and its end are: `normal mode`, `homoclinic` (the period grows without bound as the
-            energy tends to that of an equilibrium with a rod upright), `closed` (it comes back to its beginning),
-            `branch point`, `lost` or `unfinished` (see status).
+        ends: what its beginning and its end are: `normal mode` (of an equilibrium), `homoclinic` (the period grows
+            without bound as the energy tends to that of an equilibrium with a rod upright), `closed` (it comes back to
+            its beginning), `branch point`, `lost` or `unfinished` (see status).
     """
 
     orbits: PeriodicOrbit
@@ -147,8 +148,8 @@ class Family:
             PeriodicOrbit with leaves of theta1's shape. Where the family does not get there, the status is
             `NO_SUCH_ORBIT` and the rest NaN.
         Raises:
-            ValueError: theta1 not finite, or traced by `jit`; a derivative asked for at a fold in theta1, where it is
-                infinite: `slopes` has those with respect to arclength.
+            ValueError: theta1 not finite, below 1e-10 or traced by `jit`; a derivative asked for at a fold in theta1,
+                where it is infinite: `slopes` has those with respect to arclength.
         """
         return _at(self, theta1, crossing)
 
@@ -274,20 +275,27 @@ def _slopes(problem: Problem, rows: Corrected) -> Slopes:
 # The derivative with respect to theta1 is refused where less than this share of a step along the curve goes into it,
 # which is nearer to the fold than its square.
 _AT_FOLD = 1e-5
+# Below this angle [rad] rounding is what is left of an amplitude.
+_TINIEST = 1e-10
 # Each interval is looked at in this many pieces for passages through an angle.
 _PIECES = 8
 
 
 def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
     """See `Family.at`."""
-    if not isinstance(crossing, int) or crossing < 1:
+    if not isinstance(crossing, Integral) or isinstance(crossing, bool) or crossing < 1:
         raise ValueError(f"crossing must be an integer of at least 1, got {crossing!r}")
     try:
-        wanted = np.asarray(lax.stop_gradient(theta1), np.float64)
+        theta1 = jnp.asarray(theta1, jnp.float64)
+        wanted = np.asarray(lax.stop_gradient(theta1))
     except jax.errors.TracerArrayConversionError:
         raise ValueError("theta1 must be a number here, not traced by jit: use find_orbit inside jit") from None
-    if not np.all(np.isfinite(wanted)):
-        raise ValueError(f"theta1 must be finite [rad], got {wanted}: give other angles")
+    except (TypeError, ValueError):
+        raise ValueError(f"theta1 must be an angle or an array of them [rad], got {theta1!r}") from None
+    if not wanted.size or not np.all(np.isfinite(wanted)) or np.any(np.abs(wanted) < _TINIEST):
+        raise ValueError(
+            f"theta1 must be finite and at least {_TINIEST:g} in size [rad], got {wanted}: give other angles"
+        )
     problem, curve = family._problem, family._curve
     targets = np.abs(wanted.ravel())
     index, share = _passages(curve, targets, crossing)
@@ -385,6 +393,7 @@ def _tests(symmetry: str) -> list[_Test]:
             branch = "centred" if symmetry == "centred" and n % 2 == 0 else "brake"
             value = partial(lambda target, rows, c: c - target, target)
             tests.append(_Test(f"resonance_{k}:{n}", value, (branch, k) if symmetry != "odd" else None))
+    tests.append(_Test("crossing", lambda rows, c: rows.side, None))
     return tests
 
 
@@ -394,41 +403,121 @@ def _measure(rows: Corrected, symmetry: str) -> np.ndarray:
     return np.asarray(kappa if symmetry == "brake" else c)
 
 
-# A special point is located when the step is below this [arclength], and real if its equation is then met so well.
-_LOCATED, _MET = 1e-12, 1e-6
+# A special point is located when the step is below this [arclength]; one that rounding keeps from it by more than the
+# second is none.
+_LOCATED, _VAGUE = 1e-12, 1e-7
 _ROUNDS = 60
+# Where another curve crosses, c - 1 vanishes with its slope, and the energy may turn back at a corner: what is found
+# this close to it [arclength] happens there.
+_BLUNT = 5e-3
+# Rounds in which an extremum is looked for between points, by parabolas.
+_VERTICES = 5
+
+
+class _Samples(NamedTuple):
+    """Points of a curve in order: the interval each lies in, its share of it, and the rows."""
+
+    interval: np.ndarray
+    share: np.ndarray
+    rows: Corrected
 
 
 def _special_points(problem: Problem, rows: Corrected, curve: Curve, arclength: np.ndarray) -> list[SpecialPoint]:
-    """Every place between two points where a test changes sign.
+    """Every place where a test changes sign.
 
     Located by Newton's method on the family's equations together with the test's: each point is corrected onto the
     curve, and the step along it is the secant's, kept inside its bracket (Illinois).
     """
     offset = len(curve.points) - len(rows.point)
-    measure, tests = _measure(rows, problem.symmetry), _tests(problem.symmetry)
+    index = np.arange(len(rows.point)) + offset
+    samples = _with_extrema(problem, curve, arclength, _Samples(index, np.zeros(len(index)), rows))
+    measure = _measure(samples.rows, problem.symmetry)
     found = []
-    for test in tests:
-        values = test.value(rows, measure)
+    for test in _tests(problem.symmetry):
+        values = test.value(samples.rows, measure)
         (changes,) = np.nonzero((values[:-1] < 0) != (values[1:] < 0))
         found += [(test, i, values[i], values[i + 1]) for i in changes]
-    crossings = np.flatnonzero(rows.side[:-1] != rows.side[1:])
+    if not found:
+        return []
+    left = np.array([i for _, i, _, _ in found])
+    index, low = samples.interval[left], samples.share[left]
+    high = np.where(samples.interval[left + 1] == index, samples.share[left + 1], 1.0)
+    shares, located, widths = _roots(problem, curve, found, index, low, high)
+    where = arclength[index] + shares * (arclength[index + 1] - arclength[index])
+    crossings = [j for j, (test, *_) in enumerate(found) if test.kind == "crossing"]
     points = []
-    if found:
-        index = np.array([i for _, i, _, _ in found]) + offset
-        shares, located, values = _roots(problem, curve, found, index)
-        for j, (test, _, before, _) in enumerate(found):
-            if abs(values[j]) > _MET:
-                continue  # c changes from one huge value to another in less than a step can resolve
-            place = some_of(located, slice(j, j + 1))
-            kind = test.kind
-            if kind in ("above", "below"):  # the bound of the stable range: is it left?
-                kind = "stability_lost" if (before < 0) == (kind == "above") else "stability_gained"
-            where = arclength[index[j]] + shares[j] * (arclength[index[j] + 1] - arclength[index[j]])
-            points.append(_special(problem, place, where, kind, test.branch))
-    for i in crossings:
-        points.append(_special(problem, some_of(rows, slice(i, i + 1)), arclength[i + offset], "crossing", None))
+    for j, (test, _, before, _) in enumerate(found):
+        if widths[j] > _VAGUE:
+            continue
+        kind = test.kind
+        if kind in ("above", "below"):  # the bound of the stable range: is it left?
+            kind = "stability_lost" if (before < 0) == (kind == "above") else "stability_gained"
+        at = next((i for i in crossings if abs(where[i] - where[j]) < _BLUNT), j)
+        points.append(_special(problem, some_of(located, slice(at, at + 1)), where[at], kind, test.branch))
     return sorted(points, key=lambda point: float(point.arclength))
+
+
+def _with_extrema(problem: Problem, curve: Curve, arclength: np.ndarray, samples: _Samples) -> _Samples:
+    """The samples, and more about every extremum between them that may reach beyond a value that is tested: two changes
+    of sign within a step would else not be seen.
+    """
+    measure = _measure(samples.rows, problem.symmetry)
+    levels = np.arcsinh(
+        sorted({float(-test.value(samples.rows, 0 * measure)[0]) for test in _tests(problem.symmetry)[2:-1]})
+    )
+    where = arclength[samples.interval]
+    triples = []
+    for function, targets in (
+        (lambda rows: np.arcsinh(_measure(rows, problem.symmetry)), levels),
+        (lambda rows: rows.tangent[:, 0], np.zeros(1)),
+        (lambda rows: rows.energy_slope, np.zeros(1)),
+    ):
+        h = function(samples.rows)
+        before, here, after = h[:-2], h[1:-1], h[2:]
+        sense = np.where(
+            (here >= before) & (here >= after), 1.0, np.where((here <= before) & (here <= after), -1.0, 0.0)
+        )
+        # A parabola's vertex lies beyond the highest of three even points by an eighth of their range at most.
+        room = 0.5 * np.maximum(np.abs(before - here), np.abs(after - here))
+        beyond = sense[:, None] * (targets - here[:, None])
+        (near,) = np.nonzero((sense != 0) & np.any((beyond >= 0) & (beyond <= room[:, None]), axis=1))
+        triples += [(function, where[i : i + 3].copy(), h[i : i + 3] * sense[i], sense[i]) for i in near]
+    if not triples:
+        return samples
+    more = []
+    for _ in range(_VERTICES):
+        spots = np.array([_vertex(place, height) for _, place, height, _ in triples])
+        index = np.clip(np.searchsorted(arclength, spots, side="right") - 1, 0, len(curve.points) - 2)
+        share = (spots - arclength[index]) / (arclength[index + 1] - arclength[index])
+        tangents = curve.tangents_between(index, share)
+        rows = problem.corrected(curve.between(index, share), METRIC * tangents, curve.steps[index + 1])
+        more.append(_Samples(index, share, rows))
+        for j, (function, place, height, sense) in enumerate(triples):
+            _narrow(place, height, spots[j], sense * function(some_of(rows, slice(j, j + 1)))[0])
+    every = [samples, *more]
+    index, share = (np.concatenate([getattr(part, name) for part in every]) for name in ("interval", "share"))
+    order = np.lexsort((share, index))
+    return _Samples(index[order], share[order], some_of(joined(*(part.rows for part in every)), order))
+
+
+def _vertex(place: np.ndarray, height: np.ndarray) -> float:
+    """Where the parabola through three points, the middle one the highest, is highest; not on one of them."""
+    left, right = place[1] - place[0], place[2] - place[1]
+    fall_left, fall_right = (height[1] - height[0]) / left, (height[1] - height[2]) / right
+    total = fall_left + fall_right
+    shift = 0.5 * (fall_left * right - fall_right * left) / total if total > 0 else 0.0
+    if abs(shift) < 1e-3 * min(left, right):
+        shift = 1e-3 * (right if right > left else -left)
+    return float(np.clip(place[1] + shift, place[0] + 1e-3 * left, place[2] - 1e-3 * right))
+
+
+def _narrow(place: np.ndarray, height: np.ndarray, spot: float, top: float) -> None:
+    """The three points about the maximum, when `spot` is known too."""
+    points = np.append(place, spot)
+    heights = np.append(height, top)
+    order = np.argsort(points)
+    middle = int(np.clip(np.argmax(heights[order]), 1, 2))
+    place[:], height[:] = points[order][middle - 1 : middle + 2], heights[order][middle - 1 : middle + 2]
 
 
 def _special(problem: Problem, place: Corrected, where: Scalar, kind: str, branch: Any) -> SpecialPoint:
@@ -437,10 +526,14 @@ def _special(problem: Problem, place: Corrected, where: Scalar, kind: str, branc
     return SpecialPoint(where, orbit, slopes, kind, _Place(problem, place), branch)
 
 
-def _roots(problem: Problem, curve: Curve, found: list, index: np.ndarray) -> tuple:
-    """Shares of the intervals `index` at which the tests vanish, the rows there, and the tests' values."""
-    low, high = np.zeros(len(found)), np.ones(len(found))
+def _roots(  # type: ignore[no-untyped-def]
+    problem: Problem, curve: Curve, found: list, index: np.ndarray, low: np.ndarray, high: np.ndarray
+):
+    """Shares of the intervals `index`, between `low` and `high`, at which the tests vanish, the rows there, and the
+    last steps in arclength.
+    """
     at_low, at_high = (np.array([entry[k] for entry in found]) for k in (2, 3))
+    width = np.full(len(found), np.inf)
     positive = at_low > 0
     lengths = curve.lengths[index]
     share, value, last = (np.full(len(found), start) for start in (np.inf, np.inf, 0.0))
@@ -450,7 +543,8 @@ def _roots(problem: Problem, curve: Curve, found: list, index: np.ndarray) -> tu
             secant = (low * at_high - high * at_low) / (at_high - at_low)
         inside = np.isfinite(secant) & (secant > low) & (secant < high)
         secant = np.where(inside, secant, 0.5 * (low + high))
-        step, share[going] = np.abs(secant - share) * lengths, secant[going]
+        step = np.abs(secant - share) * lengths
+        width[going], share[going] = step[going], secant[going]
         tangents = curve.tangents_between(index, share)[going]
         points, normals = curve.between(index, share)[going], METRIC * tangents
         if rows is None:
@@ -475,10 +569,11 @@ def _roots(problem: Problem, curve: Curve, found: list, index: np.ndarray) -> tu
             (last, np.where(before, -1.0, 1.0)),
         ):
             old[going] = new_value[going]
-        going = going[~((step < _LOCATED) | (value == 0))[going]]
+        width[going] = np.where(value[going] == 0, 0.0, width[going])
+        going = going[width[going] >= _LOCATED]
         if not going.size:
             break
-    return share, rows, value
+    return share, rows, width
 
 
 # --- where families begin --------------------------------------------------------------------------------------------
@@ -516,9 +611,17 @@ def follow_family(
         al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
     """
     require_float64()
+    if not isinstance(pendulum, Pendulum):
+        raise ValueError(f"pendulum must be a Pendulum, got {type(pendulum).__name__}")
+    if not isinstance(start, (str, PeriodicOrbit, SpecialPoint)):
+        raise ValueError(
+            f"start must be one of {', '.join(BRANCHES)}, an orbit or a special point, got {type(start).__name__}"
+        )
     fixed = _known(pendulum)
+    if not isinstance(longest_step, Real) or isinstance(longest_step, bool):
+        raise ValueError(f"longest_step must be a finite positive number, got {longest_step!r}: give a number")
     longest = np.float64(number("longest_step", longest_step, positive=True))
-    if not isinstance(most_points, int) or most_points < 2:
+    if not isinstance(most_points, Integral) or most_points < 2:
         raise ValueError(f"most_points must be an integer of at least 2, got {most_points!r}")
     scaled = jax.tree.map(np.float64, natural(fixed))
     if isinstance(start, str):
@@ -560,11 +663,15 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, long
         raise ValueError(
             f"start must be a single orbit, got one with shape {np.shape(orbit.period)}: choose one of them"
         )
-    mine = [float(leaf) for leaf in jax.tree.leaves(orbit.pendulum)]
+    status = known_value(orbit.status)
+    if status is None:
+        raise ValueError("start must be known, not traced by jit: find it outside")
+    if status != Status.CONVERGED:
+        raise ValueError(f"start must have converged, got status {Status(int(status)).name.lower()}")
+    orbit = jax.tree.map(known_value, orbit)
+    mine = jax.tree.leaves(orbit.pendulum)
     if not np.allclose(mine, jax.tree.leaves(fixed), rtol=1e-12):
         raise ValueError(f"start must be an orbit of this pendulum, got one of {orbit.pendulum}")
-    if int(orbit.status) != Status.CONVERGED:
-        raise ValueError(f"start must have converged, got status {Status(int(orbit.status)).name.lower()}")
     second = math.sqrt(fixed.l1 / fixed.g)
     momentum = fixed.m1 * fixed.l1**2 / second
     state, dual = (

@@ -272,17 +272,17 @@ class _Search(NamedTuple):
     status: Scalar
 
 
-def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar, ratio: int | None) -> _Search:
+def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar, ratio: Scalar) -> _Search:
     """Follows a centred family from its normal mode to where it meets the wanted release.
 
-    Without `ratio` that is the `crossing`-th time that |theta1| = target; the orbit released at (-theta1, -theta2) is
-    the same one, half a period later. With `ratio` it is the release with theta2 = ratio theta1 nearest to `target`.
+    With `ratio` zero that is the `crossing`-th time that |theta1| = target; the orbit released at (-theta1, -theta2) is
+    the same one, half a period later. Otherwise it is the release with theta2 = ratio theta1 nearest to `target`.
     """
     scaled = natural(pendulum)
     arc = Arc(jnp.asarray(ARC_SYMMETRIES.index("centred")), jnp.zeros(2))
 
     def wanted(angles: Array) -> Array:
-        return jnp.abs(angles[0]) - target if ratio is None else angles[1] - ratio * angles[0]
+        return jnp.where(ratio == 0, jnp.abs(angles[0]) - target, angles[1] - ratio * angles[0])
 
     def advance(s: _Search) -> _Search:
         walk, new, taken, end = stride(scaled, s.walk, jnp.asarray(_LONGEST_STEP), arc)
@@ -311,7 +311,7 @@ def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar
     return lax.while_loop(lambda s: s.status == _RUNNING, advance, start)
 
 
-def _looked_at(s: _Search, wanted: Any, target: Scalar, crossing: Scalar, ratio: int | None) -> _Search:
+def _looked_at(s: _Search, wanted: Any, target: Scalar, crossing: Scalar, ratio: Scalar) -> _Search:
     """The search after its newest step has been looked at for the wanted release."""
     w = s.walk
 
@@ -322,12 +322,10 @@ def _looked_at(s: _Search, wanted: Any, target: Scalar, crossing: Scalar, ratio:
     values = jax.vmap(wanted)(points)
     changes = values[:-1] * values[1:] < 0
     seen = s.crossings + jnp.cumsum(changes)
-    if ratio is None:
-        here = changes & (seen == crossing)
-    else:
-        nearness = jnp.where(changes, jnp.abs(jnp.abs(points[1:, 0]) - target), jnp.inf)
-        closer = jnp.min(nearness) < jnp.where(s.found, jnp.abs(jnp.abs(s.best[0]) - target), jnp.inf)
-        here = (jnp.arange(_PIECES) == jnp.argmin(nearness)) & closer
+    nearness = jnp.where(changes, jnp.abs(jnp.abs(points[1:, 0]) - target), jnp.inf)
+    closer = jnp.min(nearness) < jnp.where(s.found, jnp.abs(jnp.abs(s.best[0]) - target), jnp.inf)
+    nearest = (jnp.arange(_PIECES) == jnp.argmin(nearness)) & closer
+    here = jnp.where(ratio == 0, changes & (seen == crossing), nearest)
     hit = jnp.any(here)
     left = jnp.argmax(here) / _PIECES
     sign = jnp.sign(wanted(at(left)))
@@ -341,10 +339,9 @@ def _looked_at(s: _Search, wanted: Any, target: Scalar, crossing: Scalar, ratio:
     low, high = lax.fori_loop(0, 50, halve, (left, left + 1 / _PIECES))
     best = jnp.where(hit, at(0.5 * (low + high)), s.best)
     found = s.found | hit
-    # With `ratio`, further on only a branch that turned back could come nearer to the target.
-    over = hit
-    if ratio is not None:
-        over = found & (jnp.abs(w.point[0]) - target > jnp.abs(jnp.abs(best[0]) - target))
+    # With a ratio, further on only a branch that turned back could come nearer to the target.
+    beyond = found & (jnp.abs(w.point[0]) - target > jnp.abs(jnp.abs(best[0]) - target))
+    over = jnp.where(ratio == 0, hit, beyond)
     status = jnp.where(over, Status.CONVERGED, s.status)
     return s._replace(crossings=seen[-1], best=best, found=found, status=status)
 
@@ -521,9 +518,11 @@ def _mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
     return replace(orbit, state=flip(orbit.state), dual=flip(orbit.dual), turns=turns)
 
 
-@partial(jax.jit, static_argnames=("ratio", "error"))
+@partial(jax.jit, static_argnames="error")
 def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, max_iterations):  # type: ignore[no-untyped-def]
-    """The orbit where a branch meets theta1 for the `crossing`-th time, or theta2 = ratio theta1 nearest to it."""
+    """The orbit where a branch meets theta1 for the `crossing`-th time; if `ratio` is not zero, theta2 = ratio theta1
+    nearest to it.
+    """
     fixed = lax.stop_gradient(pendulum)
     sign = jnp.where(theta1 < 0, -1.0, 1.0)
     target = jnp.abs(theta1)
@@ -532,14 +531,13 @@ def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, 
     point = jnp.where(found, search.best, search.reach)
     log_time, rate = _timed(fixed, point)
     guess = point[:2] * jnp.where(point[0] < 0, -1.0, 1.0)  # the same orbit, from its other rest
-    if ratio is None:
-        release = jnp.where(found, target, guess[0])
-        # The cubic's theta2 belongs to the cubic's theta1, which is off by rounding where the target is tiny.
-        x = guess[1] * lax.stop_gradient(release) / guess[0]
-        line = _Line(jnp.stack([release, 0.0]), jnp.array([0.0, 1.0]))
-    else:
-        x = guess[0]
-        line = _Line(jnp.zeros(2), jnp.array([1.0, ratio]))
+    at_angle = ratio == 0
+    release = jnp.where(found, target, guess[0])
+    # The cubic's theta2 belongs to the cubic's theta1, which is off by rounding where the target is tiny.
+    x = jnp.where(at_angle, guess[1] * lax.stop_gradient(release) / guess[0], guess[0])
+    zero = jnp.zeros(())
+    base = jnp.stack([jnp.where(at_angle, release, zero), zero])
+    line = _Line(base, jnp.where(at_angle, jnp.array([0.0, 1.0]), jnp.stack([1.0 + zero, ratio])))
     settings = _Settings(turn, tolerance, jnp.where(found, max_iterations, 1), error)
     turns = jnp.zeros(2)
     newton, steps, change = _solved(fixed, lax.stop_gradient(line), x, log_time, rate, turns, "centred", settings)
@@ -688,7 +686,7 @@ def find_orbit(
     theta1 = jnp.asarray(theta1, jnp.float64)
     if guess is None:
         slow = (branch or ("in-phase" if ratio == 1 else "anti-phase")) == "in-phase"
-        return _on_branch(pendulum, theta1, slow, crossing, ratio, **settings)
+        return _on_branch(pendulum, theta1, slow, crossing, float(ratio or 0), **settings)
     theta2, period = (jnp.asarray(number(n, v), jnp.float64) for n, v in zip(("theta2", "period"), guess, strict=True))
     if ratio is None:
         line, x = _Line(jnp.stack([theta1, 0.0]), jnp.array([0.0, 1.0])), theta2
@@ -759,6 +757,7 @@ def _multiple_of_pi(angle: float) -> bool:
 
 def _is_same(one: PeriodicOrbit, other: PeriodicOrbit) -> bool:
     """Whether two converged orbits are one: angles within 1e-8 rad and periods within 1e-8 of each other."""
-    apart = max(abs(float(one.theta1 - other.theta1)), abs(float(one.theta2 - other.theta2)))
-    longer = abs(float(one.period / other.period) - 1)
-    return int(one.status) == Status.CONVERGED and max(apart, longer) < 1e-8
+    known = [float(known_value(leaf) or 0.0) for o in (one, other) for leaf in (o.theta1, o.theta2, o.period)]
+    apart = max(abs(known[0] - known[3]), abs(known[1] - known[4]))
+    longer = abs(known[2] / known[5] - 1)
+    return known_value(one.status) == Status.CONVERGED and max(apart, longer) < 1e-8

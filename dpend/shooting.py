@@ -424,9 +424,9 @@ class Tasks(NamedTuple):
     number: Any
 
 
-# Where a family ends: this close to an equilibrium's energy, in units of the weights' torques, above the bottom with
-# the period growing (its slope in arclength as small), or on the way down to the bottom.
-HOMOCLINIC, _BOTTOM = 1e-8, 1e-4
+# Where a family ends: this close to the energy of an equilibrium with a rod upright (in units of the weights' torques,
+# the energy's slope in arclength as small), or where it has shrunk to this amplitude [rad] about an equilibrium.
+HOMOCLINIC, _SMALLEST = 1e-8, 0.01
 # Orbits that pass an equilibrium on their way are known no better than rounding over the distance from its energy:
 # where that has come to the second number [rad], the family has ended at the first.
 NEARLY, _BLURRED = 1e-6, 1e-8
@@ -489,6 +489,11 @@ def _ahead(w: Walk) -> tuple[Array, Array]:
     return jnp.where(near, cubic, w.point + w.step * along), along
 
 
+def _amplitude(point: Array) -> Scalar:
+    """The largest angle from an equilibrium on the arc, as a sine."""
+    return jnp.max(jnp.abs(jnp.sin(point[:_LOG_DELTA].reshape(SEGMENTS, 4)[:, :2])))
+
+
 def _judged(pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar) -> tuple[Walk, Scalar, Scalar]:
     """The walk after a step, whether that was taken or taken back, and how the family stands."""
     miss = new.miss / w.step
@@ -503,9 +508,10 @@ def _judged(pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar) -> tup
     levels = equilibria(pendulum).energy
     unit = levels[3]  # upright: the weights' torques
     gaps = (new.energy - levels) / unit
-    falling = new.energy_slope < 0
-    # Not past the bottom, where the curve goes on as its own mirror image.
-    longest = jnp.where(falling, jnp.minimum(longest, jnp.sqrt(jnp.abs(gaps[0]))), longest)
+    # Not past an equilibrium, where the curve goes on as its own mirror image.
+    size, before_size = _amplitude(new.point), _amplitude(w.point)
+    shrinking = size < before_size
+    longest = jnp.where(shrinking, jnp.minimum(longest, 0.5 * size), longest)
     # A step that is taken back for want of integration steps is repeated with more.
     leap = jnp.where(leaping, 2, jnp.where((w.leap == 0) & (w.step < CROSSING), 1, w.leap))
     shorter = jnp.where(leaping, 0.5 * CROSSING, jnp.where(leap > w.leap, _LEAP, 0.5 * w.step))
@@ -530,7 +536,7 @@ def _judged(pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar) -> tup
     )
     close = jnp.where(new.angle_error > _BLURRED, NEARLY, HOMOCLINIC)
     homoclinic = jnp.any(jnp.abs(gaps[1:]) < close) & (jnp.abs(new.energy_slope) < 1e3 * close * unit)
-    ended = homoclinic | ((gaps[0] < _BOTTOM) & falling)
+    ended = homoclinic | (shrinking & (size < _SMALLEST))
     status = jnp.where(taken & ended, 1, jnp.where(w.step < _SHORTEST_STEP, 2, 0))
     return jax.tree.map(partial(jnp.where, taken), after, before), taken, status
 

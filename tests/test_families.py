@@ -1,7 +1,5 @@
 """Families against numbers computed elsewhere, linear theory, single shooting, other integrators and scaling laws."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -118,8 +116,8 @@ def test_every_point_is_right_to_twelve_digits(unit, families, branch):
     assert np.max(family.orbits.error_estimate[0]) < 1e-12
     assert np.max(family.orbits.error_estimate[1] / family.orbits.period) < 1e-12
     angles = np.linspace(0.05, 2.9, 9)
-    find = jax.jit(jax.vmap(partial(dpend.find_orbit, branch=branch, error=False), in_axes=(None, 0)))
-    found, orbits = find(unit, angles), family.at(angles)
+    one_by_one = [dpend.find_orbit(unit, theta1, branch=branch) for theta1 in angles]
+    found, orbits = jax.tree.map(lambda *leaves: np.stack(leaves), *one_by_one), family.at(angles)
     np.testing.assert_allclose(orbits.theta2, found.theta2, atol=1e-12, rtol=0)
     np.testing.assert_allclose(orbits.period, found.period, rtol=1e-12)
     np.testing.assert_allclose(orbits.log_abs_kappa, found.log_abs_kappa, atol=1e-7)
@@ -195,7 +193,7 @@ def test_derivatives_that_do_not_exist():
     outer, inner = (float(fold.orbit.theta1) for fold in folds[:2])
     np.testing.assert_allclose(np.degrees([outer, inner]), [17.77, 5.42], atol=1e-2)
     for theta1, there in ((outer - 1e-3, True), (outer + 1e-3, False), (inner + 1e-3, True), (inner - 1e-3, False)):
-        again = dpend.find_orbit(heavy_below, theta1, branch="in-phase", crossing=2, error=False)
+        again = dpend.find_orbit(heavy_below, theta1, branch="in-phase", crossing=2)
         assert (again.status == Status.CONVERGED and again.theta1 < 0.4) == there
     assert all(abs(fold.slopes.theta1) < 1e-10 < abs(fold.slopes.theta2) for fold in folds)
     near = float(folds[0].orbit.theta1) * (1 - 1e-14)
@@ -281,6 +279,47 @@ def test_bad_starts_are_refused(unit, paper, families):
     with pytest.raises(ValueError, match="start must have converged"):
         dpend.follow_family(unit, families["in-phase"].at(3.5))
     assert dpend.follow_family(unit, "in-phase", most_points=40).status == Status.MAX_ITERATIONS
+    for bad in (None, True, np.array([0.1, 0.2])):
+        with pytest.raises(ValueError, match="longest_step must be a finite positive number"):
+            dpend.follow_family(unit, "in-phase", longest_step=bad)
+    with pytest.raises(ValueError, match="start must be one of .* got NoneType"):
+        dpend.follow_family(unit, None)
+    for angles in ("a", [], 1e-200, np.inf):
+        with pytest.raises(ValueError, match="theta1 must be"):
+            families["in-phase"].at(angles)
+
+
+def test_changes_within_one_step_are_found():
+    """A window of instability shorter than a step: where |kappa| exceeds 1, by shooting over the whole period."""
+    family = dpend.follow_family(Pendulum(1.0, 0.1807758472087658, 1.0, 0.9966799572101486, 9.81), "in-phase")
+    kinds = [point for point in family.special_points if point.kind.startswith("stability")]
+    assert [point.kind for point in kinds] == ["stability_lost", "stability_gained", "stability_lost"]
+    lost, gained, _ = (float(point.orbit.theta1) for point in kinds)
+    assert 0.77 < lost < gained < 0.8
+    for theta1, stable in ((lost - 1e-3, True), (0.5 * (lost + gained), False), (gained + 1e-3, True)):
+        kappa = (np.trace(monodromy(family.at(theta1), 1.0)) - 2) / 2
+        assert (abs(kappa) < 1) == stable
+
+
+def test_a_family_that_shrinks_onto_a_saddle(paper):
+    """The orbit at (40, -157.23) deg belongs to the oscillation about (0, 180) deg: its period stays finite there, 2 pi
+    over the imaginary exponent.
+    """
+    orbit = dpend.find_orbit(paper, np.radians(40), guess=(np.radians(-157.229758666), 0.789605931))
+    family = dpend.follow_family(paper, orbit)
+    assert family.ends == ("normal mode", "homoclinic")
+    frequency = np.max(dpend.equilibria(paper).exponents[1].imag)
+    np.testing.assert_allclose(family.orbits.period[0], 2 * np.pi / frequency, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_derivatives_reach_a_start_that_carries_them():
+    def period(g):
+        pendulum = Pendulum(g=g)
+        orbit = dpend.find_orbit(pendulum, 0.698, guess=(2.0855, 1.2833))
+        return dpend.follow_family(pendulum, orbit).at(0.698).period
+
+    np.testing.assert_allclose(jax.jacfwd(period)(9.8), -period(9.8) / 19.6, rtol=1e-12)
 
 
 # l2/l1 and m2/m1; the in-phase families of the third and fourth pass folds, and run through curves of covered orbits.
