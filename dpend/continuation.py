@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dpend.pendulum import Pendulum, Scalar, equilibria
+from dpend.pendulum import Pendulum, Scalar
 from dpend.shooting import (
     CHUNK,
     METRIC,
@@ -151,20 +151,20 @@ class Problem:
         return None
 
     @property
-    def weights(self) -> float:
-        """The largest potential energy, that of the upright pendulum, in natural units."""
-        return float(1 + self.natural.m2 * (1 + self.natural.l2))
+    def levels(self) -> np.ndarray:
+        """The energies of the equilibria: hanging, with one rod upright, upright. In NumPy: eager JAX would compile."""
+        upper, lower = float(1 + self.natural.m2), float(self.natural.m2 * self.natural.l2)
+        return np.array([-upper - lower, lower - upper, upper - lower, upper + lower])
 
     def _slows(self, rows: Corrected) -> bool:
         """Whether the time at the end grows like the logarithm of the distance from an equilibrium's energy."""
-        gap = np.min(np.abs(rows.energy[-1] - np.asarray(equilibria(self.natural).energy)))
+        gap = np.min(np.abs(rows.energy[-1] - self.levels))
         return bool(abs(rows.time_slope[-1]) * gap > 1e-3 * abs(rows.energy_slope[-1]))
 
     def _near_limit(self, rows: Corrected) -> bool:
         """Whether a family was lost where rounding, magnified by the inverse distance, keeps it from its end."""
-        levels = np.asarray(equilibria(self.natural).energy)[1:]
-        gap = np.min(np.abs(rows.energy[-1] - levels)) / self.weights
-        return bool(gap < NEARLY and abs(rows.energy_slope[-1]) < 1e3 * NEARLY * self.weights)
+        gap = np.min(np.abs(rows.energy[-1] - self.levels[1:])) / self.levels[3]
+        return bool(gap < NEARLY and abs(rows.energy_slope[-1]) < 1e3 * NEARLY * self.levels[3])
 
     def _back(self, origin: Corrected, rows: Corrected, since: int) -> int | None:
         """How many points it takes the curve to come back to `origin`, an orbit that it may meet at its other rest."""

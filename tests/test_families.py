@@ -208,7 +208,7 @@ def test_derivatives_that_do_not_exist():
         jax.jit(lambda theta1: family.at(theta1).period)(0.1)
 
 
-@pytest.mark.parametrize("branch", BOTH)
+@pytest.mark.parametrize("branch", [pytest.param("in-phase", marks=pytest.mark.slow), "anti-phase"])
 def test_orbits_with_no_rest_branch_off_where_stability_is_lost(unit, families, branch):
     """x(T/2) = -x(0) by diffrax, momenta that are not zero, and the stability that the old family gave away."""
     lost = families[branch].special_points[-1]
@@ -247,6 +247,7 @@ def test_orbits_of_twice_and_three_times_the_period(unit, families):
         assert np.max(np.abs(covered)) > 1e-3  # it is not the old orbit, k times
 
 
+@pytest.mark.slow
 def test_a_family_from_one_of_its_orbits(paper):
     """In both directions: the same curve as from the mode; and the brake orbit at (40, 119.49) deg belongs to those of
     twice the period that leave the anti-phase family where its c = 0.
@@ -296,6 +297,7 @@ def test_changes_within_one_step_are_found():
         assert (abs(kappa) < 1) == stable
 
 
+@pytest.mark.slow
 def test_a_family_that_shrinks_onto_a_saddle(paper):
     """The orbit at (40, -157.23) deg belongs to the oscillation about (0, 180) deg: its period stays finite there, 2 pi
     over the imaginary exponent.
