@@ -71,7 +71,8 @@ def test_direction_is_checked(paper):
         dpend.first_crossing(lower, paper, dpend.released(0.5, 0.2), 1.0, Scheme("rk8", 1e-2), direction=2)
 
 
-@pytest.mark.parametrize("name", [pytest.param("rk8-circle-rescaled", marks=pytest.mark.slow), "rk4"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rk8-circle-rescaled", "rk4"])
 def test_what_does_not_count_is_passed_by(paper, name):
     """In one step a falling function, which does not count, and a rising one: over many releases, always the latter."""
     release = jnp.linspace(0.9, 1.1, 101)

@@ -204,7 +204,7 @@ def test_everything_traces(paper):
 @pytest.mark.parametrize(
     "request_",
     [
-        {"branch": "in-phase"},
+        pytest.param({"branch": "in-phase"}, marks=pytest.mark.slow),
         pytest.param({"guess": (2.0855, 1.2833), "symmetry": "brake"}, marks=pytest.mark.slow),
     ],
 )
