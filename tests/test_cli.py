@@ -49,9 +49,8 @@ def test_both_partners_of_forty_degrees(capsys):
     assert abs(inner["energy_J"] - expected) < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("quantity", "value"), [("flip", "flip_time"), pytest.param("lyapunov", "lyapunov", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("quantity", "value"), [("flip", "flip_time"), ("lyapunov", "lyapunov")])
 def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
     out, figure = tmp_path / "m.zarr", tmp_path / "m.png"
     command = ("map", quantity, "--size", "12x10", "--duration", 0.5, "--out", out)

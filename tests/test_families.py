@@ -160,6 +160,7 @@ def test_log_kappa_beyond_any_float():
     assert (c < 0) == (trace > 0)
 
 
+@pytest.mark.slow
 def test_derivatives_of_orbits(unit):
     """Against differences of families followed anew, and the scaling laws to rounding."""
     base = np.array([0.2, 0.25, 0.1, 0.07, 9.8, 0.7])
