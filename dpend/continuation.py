@@ -17,12 +17,12 @@ from dpend.shooting import (
     NEARLY,
     PARTS,
     SEGMENTS,
-    SYMMETRIES,
     UNKNOWNS,
     Arc,
     Corrected,
     Tasks,
     Walk,
+    arc_of,
     hermite,
     laid,
     linearised,
@@ -76,7 +76,7 @@ class Problem:
 
     @property
     def arc(self) -> Arc:
-        return Arc(np.asarray(SYMMETRIES.index(self.symmetry)), np.asarray(self.turns))
+        return arc_of(self.symmetry, self.turns)
 
     def corrected(self, points: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> Corrected:
         """The points of the family in the planes through `points` that `rows` are normal to."""

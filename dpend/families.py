@@ -30,7 +30,7 @@ from dpend.continuation import (
     turned,
     way_to,
 )
-from dpend.orbits import BRANCHES, PeriodicOrbit
+from dpend.orbits import BRANCHES, PeriodicOrbit, mirrored
 from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
 from dpend.shooting import (
     FIRST_STEP,
@@ -40,8 +40,8 @@ from dpend.shooting import (
     beginning,
     natural,
     sensitivities,
-    stability_of,
 )
+from dpend.stability import stability_of
 from dpend.trajectory import Status, known_value
 
 # The longest step: a hundred points or so for a family, close enough for cubics to show every turn.
@@ -301,9 +301,8 @@ def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
     index, share = _passages(curve, targets, crossing)
     found = index >= 0
     points = curve.between(np.maximum(index, 0), share)
-    mirrored = (points[:, 0] < 0) != (wanted.ravel() < 0)
-    sides = np.where(points[:, 0] < 0, -1.0, 1.0)
-    points[:, 0] = sides * targets
+    side = np.where((points[:, 0] < 0) != (wanted.ravel() < 0), -1.0, 1.0)  # of the mirror image
+    points[:, 0] = np.where(points[:, 0] < 0, -targets, targets)
     rows = np.zeros_like(points)
     rows[:, 0] = 1.0
     solved = problem.corrected(points, rows, curve.steps[np.maximum(index, 0) + 1])
@@ -319,11 +318,11 @@ def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
             f"theta1 must not be a fold of the family for a derivative, got {angle}: it is infinite there; the "
             "family's slopes are derivatives with respect to arclength"
         )
-    along = jnp.ravel(jnp.asarray(theta1)) * np.where(mirrored, -1.0, 1.0) if traced else None
+    along = jnp.ravel(theta1) * side if traced else None
     orbits = _orbits(problem, solved, along, rows)
     status = np.where(strayed & (orbits.status == Status.CONVERGED), Status.LEFT_BRANCH, orbits.status)
     status = np.where(found, status, Status.NO_SUCH_ORBIT)
-    orbits = replace(_mirrored(orbits, mirrored), status=status)
+    orbits = replace(mirrored(orbits, side), status=status)
 
     def shaped(leaf: Any) -> Any:
         xp = np if isinstance(leaf, np.ndarray) else jnp
@@ -355,14 +354,6 @@ def _passages(curve: Curve, targets: np.ndarray, crossing: int) -> tuple[np.ndar
         same = (np.abs(curve.between(index[piece], middle)[:, 0]) < targets) == starts_below
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     return np.where(found, index[piece], -1), 0.5 * (low + high)
-
-
-def _mirrored(orbits: PeriodicOrbit, which: np.ndarray) -> PeriodicOrbit:
-    """The mirror image x -> -x of some of the orbits."""
-    sign = np.where(which, -1.0, 1.0)
-    state, dual = (jax.tree.map(lambda leaf: sign * leaf, x) for x in (orbits.state, orbits.dual))
-    turns = (sign.astype(int) * orbits.turns[0], sign.astype(int) * orbits.turns[1])
-    return replace(orbits, state=state, dual=dual, turns=turns)
 
 
 # --- special points --------------------------------------------------------------------------------------------------
@@ -462,9 +453,8 @@ def _with_extrema(problem: Problem, curve: Curve, arclength: np.ndarray, samples
     of sign within a step would else not be seen.
     """
     measure = _measure(samples.rows, problem.symmetry)
-    levels = np.arcsinh(
-        sorted({float(-test.value(samples.rows, 0 * measure)[0]) for test in _tests(problem.symmetry)[2:-1]})
-    )
+    ranged = [test for test in _tests(problem.symmetry) if test.kind.startswith(("above", "below", "resonance"))]
+    levels = np.arcsinh([-float(test.value(samples.rows, 0 * measure)[0]) for test in ranged])
     where = arclength[samples.interval]
     triples = []
     for function, targets in (
@@ -474,9 +464,8 @@ def _with_extrema(problem: Problem, curve: Curve, arclength: np.ndarray, samples
     ):
         h = function(samples.rows)
         before, here, after = h[:-2], h[1:-1], h[2:]
-        sense = np.where(
-            (here >= before) & (here >= after), 1.0, np.where((here <= before) & (here <= after), -1.0, 0.0)
-        )
+        highest, lowest = (here >= before) & (here >= after), (here <= before) & (here <= after)
+        sense = np.where(highest, 1.0, np.where(lowest, -1.0, 0.0))
         # A parabola's vertex lies beyond the highest of three even points by an eighth of their range at most.
         room = 0.5 * np.maximum(np.abs(before - here), np.abs(after - here))
         beyond = sense[:, None] * (targets - here[:, None])

@@ -7,9 +7,9 @@ given, theta2 and the period are two unknowns for two equations, without a phase
 - centred: theta(T/4) = 0 modulo pi, half the integration. The reversal (theta, p, t) -> (-theta, p, -t) about T/4 then
   gives x(T/2) = -x(0) up to full turns.
 
-A branch is followed from its normal mode by pseudo-arclength in (theta1, theta2, log of the shooting time), so that
-turning points in theta1 are passed. Everything is traceable; derivatives with respect to the pendulum and the release
-angle come from the implicit function theorem at the root, never from Newton's iterations.
+A branch is followed from its normal mode by the walk that families take (`shooting`), turning points in theta1
+included; the orbit that it leads to is solved in one piece. Everything is traceable; derivatives with respect to the
+pendulum and the release angle come from the implicit function theorem at the root, never from Newton's iterations.
 """
 
 import math
@@ -26,20 +26,17 @@ from jaxtyping import Array, Float
 
 from dpend._runtime import require_float64
 from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, normal_modes, number, released, vector_field
-from dpend.shooting import SYMMETRIES as ARC_SYMMETRIES
-from dpend.shooting import Arc, Walk, arc_times, beginning, fastest, hermite, natural, stride
-from dpend.stability import half_trace, kappa_of_brake, stability_class, transition
+from dpend.shooting import PARTS, Walk, arc_of, arc_times, beginning, fastest, hermite, natural, stride
+from dpend.stability import stability_class, stability_of, transition
 from dpend.steppers import Scheme
 from dpend.trajectory import Status, known_value, march, moved, step_size
 
 BRANCHES = ("in-phase", "anti-phase")
 SYMMETRIES = ("centred", "brake")
-# What part of the period is integrated.
-_PARTS = {"centred": 4, "brake": 2}
 
 _RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
-# rate times step [rad]: 0.1 leaves errors of rounding in theta2 and T; the walk along a branch needs no such digits.
-_FINE, _COARSE = 0.1, 0.4
+# rate times step [rad]: leaves errors of rounding in theta2 and T.
+_FINE = 0.1
 # A number of steps at which a motion cannot be what was meant: the search is lost.
 _MOST_STEPS = 200_000
 
@@ -279,7 +276,7 @@ def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar
     the same one, half a period later. Otherwise it is the release with theta2 = ratio theta1 nearest to `target`.
     """
     scaled = natural(pendulum)
-    arc = Arc(jnp.asarray(ARC_SYMMETRIES.index("centred")), jnp.zeros(2))
+    arc = arc_of("centred")
 
     def wanted(angles: Array) -> Array:
         return jnp.where(ratio == 0, jnp.abs(angles[0]) - target, angles[1] - ratio * angles[0])
@@ -411,18 +408,8 @@ def _kappas_jvp(symmetry, primals, tangents):  # type: ignore[no-untyped-def]
 
 
 def _kappas_of(symmetry: str, matrix: Array) -> Array:
-    """kappa and log |kappa| from the transition matrix over the shooting time; the logarithm cannot overflow."""
-    if symmetry == "centred":
-        c = half_trace(matrix)
-        kappa = 2 * c * c - 1
-        large = jnp.abs(c) > 1e6
-        logarithm = jnp.where(
-            large, jnp.log(2.0) + 2 * jnp.log(jnp.abs(jnp.where(large, c, 1.0))), jnp.log(jnp.abs(kappa))
-        )
-    else:
-        kappa = kappa_of_brake(matrix)
-        logarithm = jnp.log(jnp.abs(kappa))
-    return jnp.stack([kappa, logarithm])
+    """kappa and log |kappa| from the transition matrix over the shooting time."""
+    return jnp.stack(stability_of(matrix[None], symmetry, jnp)[1:])
 
 
 def _solved(
@@ -451,7 +438,7 @@ def _solved(
     if settings.error:
         # With the finer root's last update, too small to be made: a change below the tolerance would read zero.
         x, log_time = both.x[1] + both.update[1, 0], both.log_time[1] + both.update[1, 1]
-        period = _PARTS[symmetry] * jnp.exp(newton.log_time)
+        period = PARTS[symmetry] * jnp.exp(newton.log_time)
         change = jnp.stack([jnp.abs(x - newton.x), period * jnp.abs(jnp.expm1(log_time - newton.log_time))])
         change = jnp.where(both.status[1] == Status.CONVERGED, change, jnp.nan)
     return newton, steps, change
@@ -494,7 +481,7 @@ def _orbit(
     return PeriodicOrbit(
         pendulum=pendulum,
         state=state,
-        period=_PARTS[symmetry] * jnp.exp(log_time),
+        period=PARTS[symmetry] * jnp.exp(log_time),
         energy=hamiltonian(pendulum, state),
         residual=lax.stop_gradient(residual),
         iterations=newton.iterations,
@@ -508,14 +495,11 @@ def _orbit(
     )
 
 
-def _mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
-    """The mirror image theta -> -theta where `sign` is -1."""
-
-    def flip(state: State) -> State:
-        return State(sign * state.theta1, sign * state.theta2, state.p1, state.p2)
-
-    turns = (jnp.where(sign < 0, -orbit.turns[0], orbit.turns[0]), jnp.where(sign < 0, -orbit.turns[1], orbit.turns[1]))
-    return replace(orbit, state=flip(orbit.state), dual=flip(orbit.dual), turns=turns)
+def mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
+    """The mirror image x -> -x where `sign`, of the leaves' shape, is -1."""
+    state, dual = (jax.tree.map(lambda leaf: sign * leaf, x) for x in (orbit.state, orbit.dual))
+    turns = (sign.astype(int) * orbit.turns[0], sign.astype(int) * orbit.turns[1])
+    return replace(orbit, state=state, dual=dual, turns=turns)
 
 
 @partial(jax.jit, static_argnames="error")
@@ -550,7 +534,7 @@ def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, 
     status = jnp.where(found, status, search.status)
     newton = newton._replace(iterations=newton.iterations + search.iterations)
     orbit = _orbit(pendulum, line, newton, steps, change, turns, "centred", status)
-    return _mirrored(orbit, sign)
+    return mirrored(orbit, sign)
 
 
 # The walk's cubic is true to a few thousandths of its step: a root further away than this share of it is another orbit.
@@ -698,7 +682,7 @@ def find_orbit(
         line, x = _Line(jnp.zeros(2), jnp.array([1.0, ratio])), theta1
 
     def solve(x: Scalar, period: Scalar, symmetry: str) -> PeriodicOrbit:
-        x, log_time = lax.stop_gradient((x, jnp.log(period / _PARTS[symmetry])))
+        x, log_time = lax.stop_gradient((x, jnp.log(period / PARTS[symmetry])))
         return _near_guess(pendulum, line, x, log_time, symmetry, **settings)
 
     orbit = solve(x, period, symmetry or "brake")

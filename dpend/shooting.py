@@ -33,7 +33,7 @@ from dpend.pendulum import (
     normal_modes,
     vector_field,
 )
-from dpend.stability import transition
+from dpend.stability import stability_of, transition
 from dpend.steppers import Scheme
 from dpend.trajectory import moved, step_size
 from dpend.trig import sincos
@@ -65,6 +65,11 @@ class Arc(NamedTuple):
 
     symmetry: Any
     turns: Any
+
+
+def arc_of(symmetry: str, turns: Any = (0.0, 0.0)) -> Arc:
+    """An arc of this symmetry, as compiled code is told of it."""
+    return Arc(np.asarray(SYMMETRIES.index(symmetry)), jnp.asarray(turns))
 
 
 class _Segments(NamedTuple):
@@ -166,7 +171,6 @@ def _end_conditions(pendulum: Pendulum, start: Array, end: Array, unfolding: Sca
       that these are one too many for the period and the state; the unfolding parameter times grad H, added to them, is
       zero at every solution (Munoz-Almaraz et al., Physica D 181 (2003)).
     """
-
     full_turns = jnp.append(2 * jnp.pi * arc.turns, jnp.zeros(2))
 
     def gradient_and_rate(start: Array) -> Array:
@@ -181,7 +185,7 @@ def _end_conditions(pendulum: Pendulum, start: Array, end: Array, unfolding: Sca
     ])  # fmt: skip
     odd = jnp.column_stack([jnp.eye(4) + unfolding * curvature, jnp.eye(4), gradient])
     odd = jnp.concatenate([odd, jnp.append(curvature[2], jnp.zeros(5))[None]])
-    derivative = jnp.stack([jnp.asarray(_AT_REST[PARTS["centred"]]), jnp.asarray(_AT_REST[PARTS["brake"]]), odd])
+    derivative = jnp.stack([jnp.asarray(_AT_REST["centred"]), jnp.asarray(_AT_REST["brake"]), odd])
     return value[arc.symmetry], derivative[arc.symmetry]
 
 
@@ -190,7 +194,7 @@ def _rows(*columns: int) -> np.ndarray:
 
 
 # The derivatives of the conditions of orbits released from rest: of p(0), of theta or p at the end, of the unfolding.
-_AT_REST = {4: _rows(2, 3, 4, 5, 8), 2: _rows(2, 3, 6, 7, 8)}
+_AT_REST = {"centred": _rows(2, 3, 4, 5, 8), "brake": _rows(2, 3, 6, 7, 8)}
 
 
 # --- Newton's method and the walk along a family ---------------------------------------------------------------------
@@ -267,7 +271,6 @@ class _Newton(NamedTuple):
     point: Array
     iterations: Scalar
     size: Scalar  # of the last update
-    before: Scalar  # of the one before
     first: Scalar
     contraction: Scalar
     done: Scalar  # 0 while it runs, 1 when only the estimate is left, 2 after it
@@ -279,8 +282,8 @@ class _Newton(NamedTuple):
 
 def _units(pendulum: Pendulum) -> Array:
     """What an update is measured in: radians, and the momenta that belong to the rate 1."""
-    momenta = jnp.stack([1 + pendulum.m2, pendulum.m2 * pendulum.l2**1.5])
-    nodes = jnp.tile(jnp.concatenate([jnp.ones(2), momenta]), SEGMENTS)
+    inertia = jnp.stack([1 + pendulum.m2, pendulum.m2 * pendulum.l2**1.5])
+    nodes = jnp.tile(jnp.concatenate([jnp.ones(2), inertia]), SEGMENTS)
     return jnp.append(nodes, jnp.ones(2))
 
 
@@ -308,7 +311,7 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
         hopeless = ~(size < 2.0) | ((iterations > 1) & (size > n.size) & ~small) | (iterations >= _MOST_ITERATIONS)
         done = jnp.where(estimating, 2, jnp.where(small, 1, jnp.where(hopeless, 3, 0)))
         return _Newton(
-            jnp.where(estimating, n.point, n.point + update), iterations, jnp.where(estimating, n.size, size), n.size,
+            jnp.where(estimating, n.point, n.point + update), iterations, jnp.where(estimating, n.size, size),
             jnp.where(n.iterations == 0, size, n.first), contraction, done, update, null, side, equations,
         )  # fmt: skip
 
@@ -320,7 +323,7 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(_equations, pendulum, predicted, steps, arc)
     )
     start = _Newton(
-        predicted, jnp.asarray(0), jnp.asarray(jnp.inf), zero, zero, zero, jnp.asarray(0), predicted, row, zero, blank
+        predicted, jnp.asarray(0), jnp.asarray(jnp.inf), zero, zero, jnp.asarray(0), predicted, row, zero, blank
     )
     n = lax.while_loop(running, iterate, start)
     tangent = n.null / jnp.sqrt(n.null @ (METRIC * n.null))
@@ -541,47 +544,7 @@ def _judged(pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar) -> tup
     return jax.tree.map(partial(jnp.where, taken), after, before), taken, status
 
 
-# --- stability, derivatives, and arcs of other orbits ----------------------------------------------------------------
-
-
-def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, Any]:
-    """c (NaN for brake orbits), kappa and log |kappa| from the segments' matrices, shape (..., S, 4, 4).
-
-    With M the arc's matrix: c = 1 - 2 tr(a^T d) if centred, (tr(-M) - 2)/2 if odd, kappa = 2 c^2 - 1; kappa = 1 + 2
-    tr(b^T c) if brake (see `stability`). The product is scaled as it grows: no kappa is too large for its logarithm.
-
-    Arguments:
-        xp: numpy, or jax.numpy under differentiation.
-    """
-    product, scale = xp.eye(4), xp.zeros(matrices.shape[:-3])
-    for i in range(matrices.shape[-3]):
-        product = matrices[..., i, :, :] @ product
-        size = lax.stop_gradient(abs(product).max(axis=(-2, -1))) if xp is jnp else abs(product).max(axis=(-2, -1))
-        product, scale = product / size[..., None, None], scale + xp.log(size)
-    if symmetry == "odd":
-        offset, trace = -1.0, -0.5 * product.trace(axis1=-2, axis2=-1)
-    elif symmetry == "centred":
-        offset, trace, scale = 1.0, -2 * (product[..., :2, :2] * product[..., 2:, 2:]).sum(axis=(-2, -1)), 2 * scale
-    else:
-        offset, trace, scale = 1.0, 2 * (product[..., :2, 2:] * product[..., 2:, :2]).sum(axis=(-2, -1)), 2 * scale
-    value = offset + trace * xp.exp(xp.minimum(scale, _LARGEST_EXPONENT))
-    beyond = scale > _MANY_DIGITS
-    logarithm = xp.where(beyond, scale, 0.0) + _log_abs(xp.where(beyond, trace, value), xp)
-    if symmetry == "brake":
-        return xp.full_like(value, xp.nan), value, logarithm
-    kappa = 2 * xp.where(abs(value) < _LARGEST_C, value, _LARGEST_C) ** 2 - 1
-    inner = logarithm > _MANY_DIGITS
-    twice = math.log(2.0) + 2 * logarithm
-    return value, kappa, xp.where(inner, twice, _log_abs(xp.where(inner, 1.0, kappa), xp))
-
-
-def _log_abs(value: Any, xp: Any) -> Any:
-    zero = value == 0
-    return xp.where(zero, -xp.inf, xp.log(abs(xp.where(zero, 1.0, value))))
-
-
-# exp of the first is still finite; beyond exp of the second the 1 that is added does not show.
-_LARGEST_EXPONENT, _MANY_DIGITS, _LARGEST_C = 700.0, 20.0, 1e150
+# --- derivatives, and arcs of other orbits --------------------------------------------------------------------------
 
 
 @partial(jax.jit, static_argnames="symmetry")
@@ -605,12 +568,12 @@ def sensitivities(
 
 
 def _sensitivity(ratios: Array, point: Array, row: Array, steps: Scalar, turns: Array, symmetry: str) -> Array:
-    arc = Arc(jnp.asarray(SYMMETRIES.index(symmetry)), turns)
+    arc = arc_of(symmetry, turns)
 
     def ends(ratios: Array) -> Array:
         here = Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0)
         nodes = point[:_LOG_DELTA].reshape(SEGMENTS, 4)
-        time = jnp.exp(point[_LOG_DELTA]) / fastest(here, State(*nodes.T))
+        time, _ = arc_times(here, point)
         end = _stack(moved(_METHOD, here, State(*nodes.T), step_size(time, steps), steps)).T
         conditions, _ = _end_conditions(here, nodes[0], end[-1], point[_UNFOLDING], arc)
         return jnp.concatenate([(end[:-1] - nodes[1:]).ravel(), conditions])
@@ -618,9 +581,8 @@ def _sensitivity(ratios: Array, point: Array, row: Array, steps: Scalar, turns: 
     def known(both: Array) -> Array:
         point, ratios = both[:-2], both[-2:]
         here = Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0)
-
         states = State(*point[:_LOG_DELTA].reshape(SEGMENTS, 4).T)
-        times = jnp.exp(point[_LOG_DELTA]) / fastest(here, states)
+        times, _ = arc_times(here, point)
         end, matrices = transition(here, states, step_size(times, steps), steps, _METHOD)
         _, kappa, logarithm = stability_of(jnp.moveaxis(matrices, -1, 0), symmetry, jnp)
         last = jnp.stack([end.theta1[-1], end.theta2[-1], jnp.sum(times), kappa, logarithm])

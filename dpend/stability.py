@@ -13,8 +13,13 @@ Time reversal R (theta, p) -> (theta, -p) and reflection (theta, p) -> (-theta, 
   c = 1 - 2 tr(a^T d).
 """
 
+import math
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Complex, Float
 
 from dpend.pendulum import Pendulum, Scalar, State
@@ -85,6 +90,49 @@ def kappa_of_odd(half: Float[Array, "4 4"]) -> Scalar:
 def kappa_of_monodromy(matrix: Float[Array, "4 4"]) -> Scalar:
     """kappa from the derivative of the flow over a whole period: (tr M - 2)/2."""
     return (jnp.trace(matrix) - 2) / 2
+
+
+def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, Any]:
+    """c (NaN for brake orbits), kappa and log |kappa| from Phi over the shooting time, given as a product.
+
+    The same as `kappa_of_centred`, `kappa_of_brake` and `kappa_of_odd`, but that the product is scaled as it grows: no
+    kappa is too large for its logarithm.
+
+    Arguments:
+        matrices: of the consecutive segments of a quarter (centred) or half (brake, odd) of the period, shape
+            (..., S, 4, 4).
+        symmetry: `centred`, `brake` or `odd`.
+        xp: numpy, or jax.numpy under differentiation.
+    """
+    product, scale = xp.eye(4), xp.zeros(matrices.shape[:-3])
+    for i in range(matrices.shape[-3]):
+        product = matrices[..., i, :, :] @ product
+        size = lax.stop_gradient(abs(product).max(axis=(-2, -1))) if xp is jnp else abs(product).max(axis=(-2, -1))
+        product, scale = product / size[..., None, None], scale + xp.log(size)
+    if symmetry == "odd":
+        offset, trace = -1.0, -0.5 * product.trace(axis1=-2, axis2=-1)
+    elif symmetry == "centred":
+        offset, trace, scale = 1.0, -2 * (product[..., :2, :2] * product[..., 2:, 2:]).sum(axis=(-2, -1)), 2 * scale
+    else:
+        offset, trace, scale = 1.0, 2 * (product[..., :2, 2:] * product[..., 2:, :2]).sum(axis=(-2, -1)), 2 * scale
+    value = offset + trace * xp.exp(xp.minimum(scale, _LARGEST_EXPONENT))
+    beyond = scale > _MANY_DIGITS
+    logarithm = xp.where(beyond, scale, 0.0) + _log_abs(xp.where(beyond, trace, value), xp)
+    if symmetry == "brake":
+        return xp.full_like(value, xp.nan), value, logarithm
+    kappa = 2 * xp.where(abs(value) < _LARGEST_C, value, _LARGEST_C) ** 2 - 1
+    inner = logarithm > _MANY_DIGITS
+    twice = math.log(2.0) + 2 * logarithm
+    return value, kappa, xp.where(inner, twice, _log_abs(xp.where(inner, 1.0, kappa), xp))
+
+
+def _log_abs(value: Any, xp: Any) -> Any:
+    zero = value == 0
+    return xp.where(zero, -xp.inf, xp.log(abs(xp.where(zero, 1.0, value))))
+
+
+# exp of the first is still finite; beyond exp of the second the 1 that is added does not show.
+_LARGEST_EXPONENT, _MANY_DIGITS, _LARGEST_C = 700.0, 20.0, 1e150
 
 
 def multipliers(kappa: Scalar) -> Complex[Array, "4"]:

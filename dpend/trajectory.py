@@ -45,8 +45,8 @@ _MESSAGES = {
     Status.CONVERGED: "Converged.",
     Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations; try a closer guess.",
     Status.SINGULAR: "The equations are singular here, as at a fold of the family; try another release angle.",
-    Status.LEFT_BRANCH: "The branch could not be followed to this release: the motion there is too sensitive for "
-    "shooting over a quarter period; its largest |theta1| so far is returned.",
+    Status.LEFT_BRANCH: "The branch could not be followed to this release: no step was short enough to stay on it, or "
+    "the orbit found is not on it; the best so far is returned.",
     Status.NO_SUCH_ORBIT: "The branch ends without reaching this release; its largest |theta1| is returned.",
     Status.TRIVIAL_ROOT: "Newton's method fell into an equilibrium or a period of zero; try another guess.",
     Status.STEP_TOO_LARGE: "In one step a rod turned, or the fast mode advanced, by more than 1 rad; use a smaller "

@@ -7,8 +7,7 @@ import pytest
 
 import dpend
 from dpend import Pendulum, Status
-from dpend.shooting import stability_of
-from dpend.stability import transition
+from dpend.stability import stability_of, transition
 
 # m = l = g = 1: where c - 1 and c change sign, theta1, theta2, T (None where only theta1 is known).
 SPECIAL = {

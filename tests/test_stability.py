@@ -44,6 +44,9 @@ def test_quarter_half_and_whole_period_agree(orbits):
             stability.kappa_of_brake(half),
             stability.kappa_of_odd(half),
             stability.kappa_of_monodromy(whole),
+            stability.stability_of(np.asarray(quarter)[None], "centred")[1],
+            stability.stability_of(np.asarray(half)[None], "brake")[1],
+            stability.stability_of(np.asarray(half)[None], "odd")[1],
             orbit.kappa,
         ]
         np.testing.assert_allclose(routes, routes[0], rtol=1e-8, atol=1e-10)
