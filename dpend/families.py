@@ -594,7 +594,8 @@ def follow_family(
         most_points: on one side of the start.
     Raises:
         ValueError: an unknown name; g not positive; an orbit of another pendulum, or that has not converged; a special
-            point where nothing branches off.
+            point where nothing branches off, or only orbits (c = -1 in half of the cases) that are centred no longer
+            and never rest.
         RuntimeError: float64 is switched off in JAX.
     See also: Doedel, Keller and Kernevez, Numerical analysis and control of bifurcation problems (1991); Peeters et
         al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
@@ -743,8 +744,11 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: Scala
     for sign in (1.0, -1.0):
         rows = problem.onto_branch(base.rows, point, sign)
         if rows is None:
+            # At c = -1 either C loses rank, and orbits at rest branch off, or B vanishes, and they pass through
+            # theta in {0, pi}^2 at T/4 and at 3 T/4 without ever resting.
+            why = "whose orbits are never at rest" if (symmetry, k) == ("brake", 1) else "without one nearby"
             raise ValueError(
-                f"start must be a point where a family branches off, got {special.kind} without one nearby"
+                f"start must be a point where a family that can be followed branches off, got {special.kind} {why}"
             )
         start = begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, longest), rows.steps[0])
         ahead, end = problem.followed(start, rows, longest, most)

@@ -298,6 +298,34 @@ def test_changes_within_one_step_are_found():
 
 
 @pytest.mark.slow
+def test_what_branches_off_at_c_of_minus_one():
+    """With Phi(T/2) = [[A, B], [C, D]]: where C vanishes on a release, brake orbits that are not centred, at rest after
+    half a period by diffrax; where B vanishes the displacement is of the momenta alone, and there is no rest.
+    """
+    pendulum = Pendulum(1.0, 3.0, 1.0, 0.3, 1.0)
+    family = dpend.follow_family(pendulum, "in-phase")
+    kinds = []
+    for point in family.special_points:
+        half = monodromy(point.orbit, 0.5) if point.kind.startswith("stability") else np.eye(4)
+        if abs(np.trace(half)) > 1e-3:
+            continue
+        at_rest = bool(np.max(np.abs(half[:2, 2:])) > 1e-3)
+        kinds.append(at_rest)
+        if not at_rest:
+            with pytest.raises(ValueError, match="whose orbits are never at rest"):
+                dpend.follow_family(pendulum, point)
+            continue
+        branch = dpend.follow_family(pendulum, point, most_points=20)
+        assert branch.symmetry == "brake"
+        orbit = single(branch.orbits, 8)
+        np.testing.assert_allclose(branch.orbits.period[0], point.orbit.period, rtol=1e-3)
+        states = motion(orbit)
+        np.testing.assert_allclose(states[2:, 29], 0, atol=1e-9)
+        assert np.max(np.abs(np.sin(states[:2, 14]))) > 1e-3  # not centred
+    assert sorted(kinds) == [False, False, True, True]
+
+
+@pytest.mark.slow
 def test_a_family_that_shrinks_onto_a_saddle(paper):
     """The orbit at (40, -157.23) deg belongs to the oscillation about (0, 180) deg: its period stays finite there, 2 pi
     over the imaginary exponent.
