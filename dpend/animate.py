@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dpend.files import check_place, replacing
 from dpend.pendulum import Pendulum, State, fast_frequency, number, positions
-from dpend.plots import LOWER, UPPER, check_place, replacing
+from dpend.plots import LOWER, UPPER
 from dpend.trajectory import Trajectory, simulate
 
 if TYPE_CHECKING:

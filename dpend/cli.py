@@ -6,7 +6,6 @@ error. 130: interrupted.
 
 import contextlib
 import csv
-import json
 import math
 import os
 import sys
@@ -21,9 +20,9 @@ import numpy as np
 import typer
 
 import dpend
+from dpend.files import as_json, check_place, replacing
 from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
-from dpend.plots import check_place, replacing
 from dpend.steppers import METHODS
 from dpend.sweeps import check_store
 from dpend.trajectory import Status, Trajectory
@@ -463,21 +462,8 @@ def _degrees(radians: Any) -> float:
     return math.degrees(float(radians))
 
 
-def _as_json(record: dict[str, Any]) -> str:
-    """NaN and infinity become null."""
-
-    def clean(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: clean(item) for key, item in value.items()}
-        if isinstance(value, list):
-            return [clean(item) for item in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(clean(record), indent=2, allow_nan=False)
-
-
 def _print_json(record: dict[str, Any]) -> None:
-    print(_as_json(record))
+    print(as_json(record))
 
 
 def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
@@ -596,7 +582,7 @@ def _write_family_csv(record: dict[str, Any], path: Path) -> None:
 
 
 def _write_json(record: dict[str, Any], path: Path) -> None:
-    path.write_text(_as_json(record) + "\n")
+    path.write_text(as_json(record) + "\n")
 
 
 def _write_netcdf(motion: Trajectory, path: Path) -> None:

@@ -64,6 +64,15 @@ class Curve:
         return mixed / np.sqrt(np.sum(METRIC * mixed**2, axis=1))[:, None]
 
 
+@dataclass(frozen=True)
+class Reach:
+    """How far a family is followed: the longest step in arclength, the most points, and the longest period."""
+
+    step: float
+    points: int
+    period: float
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Problem:
@@ -89,14 +98,14 @@ class Problem:
             tables.append(np.asarray(table)[:count])
         return unpacked(np.concatenate(tables))
 
-    def followed(self, start: Walk, origin: Corrected | None, longest: Scalar, most: int) -> tuple[Corrected, str]:
+    def followed(self, start: Walk, origin: Corrected | None, reach: "Reach") -> tuple[Corrected, str]:
         """The points after `start`, and what the family's end is; `origin` is the place it could come back to."""
         nothing = np.zeros((CHUNK, UNKNOWNS))
         tasks = Tasks(nothing, nothing, nothing[:, 0].astype(int), np.int64(0))
         tables: list[np.ndarray] = []
         count, end = 0, ""
-        while not end and count < most:
-            start, table, more, status = walk(self.natural, start, longest, tasks, self.arc)
+        while not end and count < reach.points:
+            start, table, more, status = walk(self.natural, start, np.float64(reach.step), tasks, self.arc)
             tables.append(np.asarray(table)[: int(more)])
             rows, count = unpacked(np.concatenate(tables)), count + int(more)
             end = ("", "ended", "lost")[int(status)]
@@ -105,8 +114,11 @@ class Problem:
             back = None if origin is None else self._back(origin, rows, count - int(more))
             if back is not None:
                 return _cut(rows, back)
-        if count > most:
-            return some_of(rows, slice(most)), "unfinished"
+            (longer,) = np.nonzero(PARTS[self.symmetry] * rows.times.sum(axis=1) > reach.period)
+            if longer.size:
+                return some_of(rows, slice(longer[0] + 1)), "longest period"
+        if count > reach.points:
+            return some_of(rows, slice(reach.points)), "unfinished"
         if end == "ended":
             end = "homoclinic" if self._slows(rows) else "normal mode"
         return rows, end or "unfinished"

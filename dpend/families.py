@@ -21,6 +21,7 @@ from dpend.continuation import (
     LARGEST_COVER,
     Curve,
     Problem,
+    Reach,
     begun,
     curve_of,
     joined,
@@ -111,7 +112,7 @@ class Family:
             enough, `MAX_ITERATIONS` if it has more points than were allowed.
         ends: what its beginning and its end are: `normal mode` (of an equilibrium), `homoclinic` (the period grows
             without bound as the energy tends to that of an equilibrium with a rod upright), `closed` (it comes back to
-            its beginning), `branch point`, `lost` or `unfinished` (see status).
+            its beginning), `branch point`, `longest period` (if one was given), `lost` or `unfinished` (see status).
     """
 
     orbits: PeriodicOrbit
@@ -573,6 +574,7 @@ def follow_family(
     start: "str | PeriodicOrbit | SpecialPoint",
     *,
     longest_step: float = _LONGEST_STEP,
+    longest_period: float = math.inf,
     most_points: int = _MOST_POINTS,
 ) -> Family:
     """The family of periodic orbits that `start` belongs to, from end to end.
@@ -591,6 +593,7 @@ def follow_family(
             centred orbits with c = 1 the orbits with x(T/2) = -x(0) that are no longer released from rest, with c = -1
             those released from rest that are no longer centred, at a resonance the brake orbits of k times the period.
         longest_step: in arclength; the default gives about a hundred points.
+        longest_period: [s]; the family is followed no further than to its first orbit that takes longer.
         most_points: on one side of the start.
     Raises:
         ValueError: an unknown name; g not positive; an orbit of another pendulum, or that has not converged; a special
@@ -601,29 +604,38 @@ def follow_family(
         al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
     """
     require_float64()
-    if not isinstance(pendulum, Pendulum):
-        raise ValueError(f"pendulum must be a Pendulum, got {type(pendulum).__name__}")
+    fixed = known_pendulum(pendulum)
     if not isinstance(start, (str, PeriodicOrbit, SpecialPoint)):
         raise ValueError(
             f"start must be one of {', '.join(BRANCHES)}, an orbit or a special point, got {type(start).__name__}"
         )
-    fixed = _known(pendulum)
     if not isinstance(longest_step, Real) or isinstance(longest_step, bool):
         raise ValueError(f"longest_step must be a finite positive number, got {longest_step!r}: give a number")
-    longest = np.float64(number("longest_step", longest_step, positive=True))
+    step = float(number("longest_step", longest_step, positive=True))
+    period = math.inf
+    if not (isinstance(longest_period, float) and math.isinf(longest_period) and longest_period > 0):
+        period = float(number("longest_period", longest_period, positive=True, unit="s"))
     if not isinstance(most_points, Integral) or most_points < 2:
         raise ValueError(f"most_points must be an integer of at least 2, got {most_points!r}")
     scaled = jax.tree.map(np.float64, natural(fixed))
+    reach = Reach(step, most_points, period / math.sqrt(fixed.l1 / fixed.g))
     if isinstance(start, str):
         if start not in BRANCHES:
             raise ValueError(f"start must be one of {', '.join(BRANCHES)}, or an orbit, got {start!r}")
-        return _from_mode(Problem(pendulum, scaled, "centred", (0.0, 0.0)), start, longest, most_points)
+        return _from_mode(Problem(pendulum, scaled, "centred", (0.0, 0.0)), start, reach)
     if isinstance(start, SpecialPoint):
-        return _from_branch_point(pendulum, start, longest, most_points)
-    return _from_orbit(pendulum, scaled, start, longest, most_points)
+        return _from_branch_point(pendulum, start, reach)
+    return _from_orbit(pendulum, scaled, start, reach)
 
 
-def _known(pendulum: Pendulum) -> Pendulum:
+def known_pendulum(pendulum: Pendulum) -> Pendulum:
+    """The numbers behind a pendulum.
+
+    Raises:
+        ValueError: no pendulum; a field traced by `jit`; g not positive.
+    """
+    if not isinstance(pendulum, Pendulum):
+        raise ValueError(f"pendulum must be a Pendulum, got {type(pendulum).__name__}")
     values = {}
     for name, leaf in vars(pendulum).items():
         value = known_value(leaf)
@@ -638,17 +650,22 @@ def _known(pendulum: Pendulum) -> Pendulum:
 _beginning = jax.jit(beginning)
 
 
-def _from_mode(problem: Problem, branch: str, longest: Scalar, most: int) -> Family:
+def _from_mode(problem: Problem, branch: str, reach: Reach) -> Family:
     start = jax.tree.map(np.asarray, _beginning(problem.natural, branch == "in-phase"))
-    rows, end = problem.followed(start, None, longest, most)
+    rows, end = problem.followed(start, None, reach)
+    if not len(rows.point):
+        raise ValueError(
+            f"longest_period must be longer than a family's first orbits, got {reach.period:g} units of "
+            "sqrt(l1/g): give a longer one"
+        )
     curve = curve_of(rows)
     points, tangents = np.vstack([start.point, curve.points]), np.vstack([start.tangent, curve.tangents])
     curve = Curve(points, tangents, np.append(start.steps, curve.steps))
     return _family(problem, rows, curve, ("normal mode", end))
 
 
-def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, longest: Scalar, most: int) -> Family:
-    fixed = _known(pendulum)
+def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reach: Reach) -> Family:
+    fixed = known_pendulum(pendulum)
     if np.shape(orbit.period):
         raise ValueError(
             f"start must be a single orbit, got one with shape {np.shape(orbit.period)}: choose one of them"
@@ -676,21 +693,21 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, long
     rows = problem.on_curve(point)
     if rows is None or np.linalg.norm(way_to(rows.point[0, :2], state[:2])) > _SAME_ORBIT:
         raise ValueError("start must be an orbit whose motion is still known at the end of its arc: give another one")
-    return _both_ways(problem, rows, longest, most)
+    return _both_ways(problem, rows, reach)
 
 
 # How far the corrected start may be from the orbit that was given [rad].
 _SAME_ORBIT = 1e-5
 
 
-def _both_ways(problem: Problem, rows: Corrected, longest: Scalar, most: int) -> Family:
+def _both_ways(problem: Problem, rows: Corrected, reach: Reach) -> Family:
     """The family through a point, in both directions unless it is closed."""
-    first = min(FIRST_STEP, longest)
+    first = min(FIRST_STEP, reach.step)
     start = begun(rows.point[0], rows.tangent[0], first, rows.steps[0])
-    ahead, end = problem.followed(start, rows, longest, most)
+    ahead, end = problem.followed(start, rows, reach)
     if end == "closed":
         return _closed(problem, rows, ahead)
-    behind, begin = problem.followed(start._replace(tangent=-start.tangent), rows, longest, most)
+    behind, begin = problem.followed(start._replace(tangent=-start.tangent), rows, reach)
     rows = joined(turned(behind), rows, ahead)
     return _family(problem, rows, curve_of(rows), (begin, end))
 
@@ -728,7 +745,7 @@ def _family(problem: Problem, rows: Corrected, curve: Curve, ends: tuple[str, st
 _FLAT = 1e-5
 
 
-def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: Scalar, most: int) -> Family:
+def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) -> Family:
     if special._branch is None:
         raise ValueError(f"start must be a point where a family branches off, got {special.kind}: follow its orbit")
     symmetry, k = special._branch
@@ -750,8 +767,8 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, longest: Scala
             raise ValueError(
                 f"start must be a point where a family that can be followed branches off, got {special.kind} {why}"
             )
-        start = begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, longest), rows.steps[0])
-        ahead, end = problem.followed(start, rows, longest, most)
+        start = begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, reach.step), rows.steps[0])
+        ahead, end = problem.followed(start, rows, reach)
         if end == "closed":
             return _closed(problem, rows, ahead)
         sides.append((joined(rows, ahead), end))

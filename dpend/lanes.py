@@ -9,6 +9,7 @@ A launch is a fixed number of blocks, of which only as many run as there are lan
 serves any number of lanes, and every lane's bits are the same whatever number of lanes, launches or devices there are.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
@@ -29,8 +30,9 @@ from dpend.pendulum import Scalar
 # 26 (11), 18 (4). At 32 LLVM unrolls the loops over lanes before it looks for vectors in them; at 128 order 8 outgrows
 # the cache.
 WIDTH = 64
-# Blocks a device takes in one launch: enough that the millisecond of starting one is lost, also for short motions.
-_BLOCKS = 256
+# Blocks a device takes in one launch: enough that the millisecond of starting one is lost, also for short motions;
+# where each lane gives more than so many numbers, fewer.
+_BLOCKS, _FEW_NUMBERS = 256, 64
 # Launches under way at once: one runs, one waits, so that no device stands still while results are collected.
 _UNDER_WAY = 2
 
@@ -39,17 +41,15 @@ def over_lanes(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> A
     """function(shared, one) for every lane `one` of `each`, in order.
 
     Arguments:
-        function: traceable, from pytrees of float64 scalars to a pytree of scalars (integers below 2^53). One compiled
-            program is kept for each function that equals none before.
+        function: traceable, from pytrees of float64 scalars to a pytree of scalars or arrays (integers below 2^53). One
+            compiled program is kept for each function that equals none before.
         shared: a pytree of scalars, the same for all lanes.
         each: a pytree with leaves of shape (n,), n at least 1.
     Returns:
-        The pytree of results, NumPy arrays of shape (n,).
-    Raises:
-        ValueError: a result is not a scalar.
+        The pytree of results, NumPy arrays of shape (..., n).
     """
     pieces = list(launches(function, shared, each))
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *pieces)
 
 
 def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> Iterator[Any]:
@@ -63,11 +63,12 @@ def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> Ite
         yield _collected(np.asarray(_vmapped(function, shared, structure, table)), kinds)
         return
     mesh = Mesh(np.array(devices), ("devices",))
-    size = len(devices) * _BLOCKS * WIDTH
+    blocks = max(1, _BLOCKS * _FEW_NUMBERS // max(_FEW_NUMBERS, _rows(kinds)))
+    size = len(devices) * blocks * WIDTH
     under_way: deque[tuple[jax.Array, int]] = deque()
     for start in range(0, table.shape[1], size):
         piece = table[:, start : start + size]
-        rows = _blocks(function, structure, mesh, shared, *_dealt(piece, mesh))
+        rows = _blocks(function, structure, mesh, shared, *_dealt(piece, mesh, blocks))
         under_way.append((rows, piece.shape[1]))
         if len(under_way) == _UNDER_WAY:
             yield _gathered(*under_way.popleft(), kinds)
@@ -75,27 +76,39 @@ def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> Ite
         yield _gathered(*under_way.popleft(), kinds)
 
 
-def _dealt(piece: np.ndarray, mesh: Mesh) -> tuple[Any, Any]:
+def _dealt(piece: np.ndarray, mesh: Mesh, blocks: int) -> tuple[Any, Any]:
     """The blocks, dealt to the devices like cards so that all get alike, and how many of its own each has to run."""
     devices = mesh.devices.size
     values, lanes = piece.shape
-    filled = np.empty((values, devices * _BLOCKS * WIDTH))
+    filled = np.empty((values, devices * blocks * WIDTH))
     filled[:, :lanes], filled[:, lanes:] = piece, piece[:, -1:]  # short blocks repeat the last lane
     counts = (-(-lanes // WIDTH) + devices - 1 - np.arange(devices)) // devices
     place = NamedSharding(mesh, Spec("devices"))
-    hands = filled.reshape(values, _BLOCKS, devices, WIDTH).transpose(2, 1, 0, 3)
+    hands = filled.reshape(values, blocks, devices, WIDTH).transpose(2, 1, 0, 3)
     return jax.device_put(hands, place), jax.device_put(counts, place)
 
 
 def _gathered(rows: jax.Array, lanes: int, kinds: Any) -> Any:
-    table = np.asarray(rows).transpose(2, 1, 0, 3)  # values, blocks, devices, width
+    shards = sorted(rows.addressable_shards, key=lambda shard: shard.index[0].start)
+    used = -(-lanes // (len(shards) * WIDTH))
+    hands = np.stack([np.asarray(shard.data)[0, :used] for shard in shards])  # devices, blocks, values, width
+    table = hands.transpose(2, 1, 0, 3)
     return _collected(table.reshape(table.shape[0], -1)[:, :lanes], kinds)
 
 
 def _collected(table: np.ndarray, kinds: Any) -> Any:
     """The table's rows as the tree that the function gives, each of its own kind."""
     leaves, structure = jax.tree.flatten(kinds)
-    return jax.tree.unflatten(structure, [row.astype(kind.dtype) for row, kind in zip(table, leaves, strict=True)])
+    parts = np.split(table, np.cumsum([math.prod(kind.shape) for kind in leaves])[:-1])
+    shaped = [
+        part.reshape(*kind.shape, -1).astype(kind.dtype, copy=False) for part, kind in zip(parts, leaves, strict=True)
+    ]
+    return jax.tree.unflatten(structure, shaped)
+
+
+def _rows(kinds: Any) -> int:
+    """How many numbers a lane gives."""
+    return sum(math.prod(kind.shape) for kind in jax.tree.leaves(kinds))
 
 
 @lru_cache(maxsize=64)
@@ -103,20 +116,14 @@ def _kinds(function: Callable[[Any, Any], Any], shared: PyTreeDef, each: PyTreeD
     """The tree of shapes and types that the function gives."""
     scalar = jax.ShapeDtypeStruct((), jnp.float64)
     trees = (jax.tree.unflatten(tree, [scalar] * tree.num_leaves) for tree in (shared, each))
-    kinds = jax.eval_shape(function, *trees)
-    for path, kind in jax.tree_util.tree_leaves_with_path(kinds):
-        if kind.shape != ():
-            raise ValueError(
-                f"each value of a quantity must be a scalar, got shape {kind.shape} for {jax.tree_util.keystr(path)}: "
-                "return its components under names of their own"
-            )
-    return kinds
+    return jax.eval_shape(function, *trees)
 
 
 def _row_by_row(function: Callable[[Any, Any], Any], shared: Any, each: PyTreeDef, table: jax.Array) -> jax.Array:
     """Values in rows, lanes in columns, in and out: XLA copies several arrays whole where it updates one in place."""
-    mapped = jax.vmap(function, in_axes=(None, 0))(shared, jax.tree.unflatten(each, list(table)))
-    return jnp.stack([leaf.astype(jnp.float64) for leaf in jax.tree.leaves(mapped)])
+    mapped = jax.vmap(function, in_axes=(None, 0), out_axes=-1)(shared, jax.tree.unflatten(each, list(table)))
+    lanes = table.shape[1]
+    return jnp.concatenate([leaf.astype(jnp.float64).reshape(-1, lanes) for leaf in jax.tree.leaves(mapped)])
 
 
 _vmapped = jax.jit(_row_by_row, static_argnums=(0, 2))
@@ -131,9 +138,9 @@ def _blocks(
             values = _row_by_row(function, shared, each, hand[0, index])
             return lax.dynamic_update_index_in_dim(done, values, index, 0)
 
-        return lax.fori_loop(0, count[0], block, jnp.zeros((_BLOCKS, rows, WIDTH)))[None]
+        return lax.fori_loop(0, count[0], block, jnp.zeros((hand.shape[1], rows, WIDTH)))[None]
 
-    rows = len(jax.tree.leaves(_kinds(function, jax.tree.structure(shared), each)))
+    rows = _rows(_kinds(function, jax.tree.structure(shared), each))
     spread = jax.shard_map(
         on_one_device,
         mesh=mesh,

@@ -1,15 +1,9 @@
 """Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them) and of maps.
 
-Each function draws into the axes it is given, or into new ones, and returns them. Whoever writes a file, of whatever
-kind, does so through `check_place`, before anything is computed, and `replacing`. Colours are from Okabe and Ito's
+Each function draws into the axes it is given, or into new ones, and returns them. Colours are from Okabe and Ito's
 palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion for the lower.
 """
 
-import contextlib
-import os
-import tempfile
-from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,7 +12,6 @@ import numpy as np
 from dpend.families import Family
 from dpend.orbits import PeriodicOrbit
 from dpend.pendulum import Pendulum, State, energies, positions
-from dpend.sweeps import unwritable
 from dpend.trajectory import Trajectory, simulate
 
 if TYPE_CHECKING:
@@ -256,37 +249,3 @@ def _no_flip(dataset: Any, ax: "Axes", across: str) -> None:
     saddle = -abs(weight1 - weight2)
     arguments = (theta1, theta2, height.T) if across == "theta1" else (theta2, theta1, height)
     ax.contour(*arguments, levels=[saddle], colors="black", linewidths=1.0)
-
-
-# --- saving ----------------------------------------------------------------------------------------------------------
-
-
-def check_place(name: str, path: Path, suffixes: Sequence[str]) -> None:
-    """Refuses, before anything is computed, a file that could not be written after.
-
-    Raises:
-        ValueError: another suffix; no directory to write in. `name` is the argument that is told.
-    """
-    if path.suffix not in suffixes:
-        raise ValueError(f"{name} must end in {' or '.join(suffixes)}, got {path}: give another name")
-    reason = "Is a directory" if os.path.isdir(path) else unwritable(path)
-    if reason:
-        raise ValueError(
-            f"{name} must be a file in a directory that can be written to, got {path} ({reason}): give another place"
-        )
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`, which takes its place if all goes well: a file that is there, old or new, is
-    always whole.
-    """
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    try:
-        yield Path(name)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise

@@ -11,7 +11,6 @@ import json
 import math
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -22,6 +21,7 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
+from dpend.files import unwritable
 from dpend.lanes import launches, over_lanes
 from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
 from dpend.steppers import Scheme, scheme_for
@@ -419,6 +419,12 @@ def _kinds(task: _Task) -> dict[str, np.dtype]:
     scalar = jax.ShapeDtypeStruct((), np.float64)
     shared = jax.tree.map(lambda _: scalar, task.shared)
     kinds = dict(jax.eval_shape(task.cell, shared, dict.fromkeys(task.grid.axes, scalar)))
+    for key, kind in kinds.items():
+        if kind.shape != ():
+            raise ValueError(
+                f"each value of a quantity must be a scalar, got shape {kind.shape} for {key}: return its components "
+                "under names of their own"
+            )
     del kinds[_TAKEN]
     kinds.pop("status", None)
     taken = [key for key in kinds if key in _STATE + _PENDULUM or key in _coordinates(task.grid)]
@@ -482,19 +488,6 @@ def _labelled(task: _Task, values: dict[str, np.ndarray], attributes: dict[str, 
 
 
 # --- the store -------------------------------------------------------------------------------------------------------
-
-
-def unwritable(path: Path) -> str:
-    """Why no new file can be put beside `path`, in the system's words; empty if one can.
-
-    It is tried: permissions do not tell what the root user, a disk mounted for reading or the system's own directories
-    allow, nor how long a name may be.
-    """
-    try:
-        tempfile.NamedTemporaryFile(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent).close()
-    except OSError as error:
-        return error.strerror or str(error)
-    return ""
 
 
 def check_store(name: str, path: Path) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import dpend
 
-ORDER = """_runtime trig pendulum steppers trajectory events lanes chaos sweeps stability shooting continuation orbits
-families atlas certify fit plots animate cli""".split()
+ORDER = """_runtime files trig pendulum steppers trajectory events lanes chaos sweeps stability shooting continuation
+orbits families scan atlas survey certify fit plots animate cli""".split()
 HOUSE = Path(dpend.__file__).parent
 
 

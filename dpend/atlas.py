@@ -1,0 +1,387 @@
+"""The atlas: every brake orbit of one release angle up to a period, and the table and file of many orbits.
+
+`scan` finds all returns to rest, `find_orbit` solves them to rounding. An `Atlas` is a table with what was done to find
+its rows; those of families over the whole square come from `survey`.
+"""
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dpend._runtime import require_float64
+from dpend.families import known_pendulum
+from dpend.files import as_json, check_place, replacing
+from dpend.orbits import PeriodicOrbit, find_orbit
+from dpend.pendulum import Pendulum, number, released
+from dpend.scan import Scan, Zero, scanned
+from dpend.shooting import natural
+from dpend.trajectory import Status
+
+# Intervals of theta2 that a scan begins with, and how often they are doubled at most.
+_INTERVALS, _MOST_REFINEMENTS = 128, 6
+# A scan looks this share further than asked, so that an orbit of just the longest period lies inside.
+_BEYOND = 1e-3
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How a search was made, and what speaks for its being complete.
+
+    Attributes:
+        theta2_points: motions that were integrated by the last scan, or by those of all slices.
+        time_points: rows in time at which each was looked at.
+        refinements: how often the intervals of theta2 were doubled; of the whole square how often the slices were.
+        suspicious_cells: places that were left undecided: intervals of theta2 too narrow to halve; returns to rest that
+            Newton's method did not confirm; of the whole square also passages of families that no return answers to.
+        winding, degree: how often p at the last time goes round zero as theta2 goes round, and the sum of the signs of
+            all returns found, those of orbits run through several times included: unequal if one is missing. Of several
+            slices their sums.
+        slices: release angles that were scanned.
+    """
+
+    theta2_points: int
+    time_points: int
+    refinements: int
+    suspicious_cells: int
+    winding: int
+    degree: int
+    slices: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """Brake orbits in a table, a row each.
+
+    Attributes:
+        pendulum: theirs.
+        max_period: how far was looked [s].
+        table: columns by name, shape (n,), in radians and SI units: `family` (empty for a single release angle) and
+            `arclength` along it; `theta1`, `theta2`, `period`, `energy`, `kappa`, `log_abs_kappa`, `symmetry`,
+            `residual`, `iterations` and `status` as in `PeriodicOrbit`, and from there `dual_theta1`, `dual_theta2`,
+            `turns1`, `turns2`, `theta2_error`, `period_error`.
+        families: a record for each, see `find_brake_families`; none for a single release angle.
+        coverage: how they were found.
+    """
+
+    pendulum: Pendulum
+    max_period: float
+    table: dict[str, np.ndarray]
+    families: tuple[dict[str, Any], ...]
+    coverage: Coverage
+
+    def __len__(self) -> int:
+        return len(self.table["period"])
+
+    @property
+    def orbits(self) -> tuple[PeriodicOrbit, ...]:
+        """The rows as orbits."""
+        rows = ({key: column[i] for key, column in self.table.items()} for i in range(len(self)))
+        return tuple(_orbit(self.pendulum, row) for row in rows)
+
+    def where(
+        self,
+        *,
+        period: tuple[float, float] | None = None,
+        energy: tuple[float, float] | None = None,
+        kappa: tuple[float, float] | None = None,
+        symmetry: str | None = None,
+        family: str | Sequence[str] | None = None,
+    ) -> "Atlas":
+        """The rows with period [s], energy [J] and kappa in closed ranges, of a symmetry, of one family or of several.
+
+        Raises:
+            ValueError: a range that is none; a symmetry or family that no row has.
+        """
+        keep = np.ones(len(self), bool)
+        for name, bounds in (("period", period), ("energy", energy), ("kappa", kappa)):
+            if bounds is not None:
+                low, high = _range(name, bounds)
+                keep &= (self.table[name] >= low) & (self.table[name] <= high)
+        for name, wanted in (("symmetry", symmetry), ("family", family)):
+            if wanted is not None:
+                names, known = [wanted] if isinstance(wanted, str) else list(wanted), set(self.table[name].tolist())
+                for one in names:
+                    if one not in known:
+                        raise ValueError(f"{name} must be one of {', '.join(sorted(known))}, got {one!r}")
+                keep &= np.isin(self.table[name], names)
+        table = {key: column[keep] for key, column in self.table.items()}
+        left = set(table["family"].tolist())
+        return replace(self, table=table, families=tuple(one for one in self.families if one["family"] in left))
+
+    def record(self) -> dict[str, Any]:
+        """All of it as plain numbers and text, angles in degrees: what `save` writes and `--json` prints."""
+        columns = {_file_name(key): _out(key, column).tolist() for key, column in self.table.items()}
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        for row in rows:
+            row["status"] = Status(row["status"]).name.lower()
+            row["dual"] = {key: row.pop(f"dual_{key}") for key in ("theta1_deg", "theta2_deg")}
+            row["turns"] = [row.pop("turns1"), row.pop("turns2")]
+        return {**self._about(), "orbits": rows}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes F.json, or F.csv whose first line is a comment with all but the table, to be read by `load_atlas`.
+
+        Angles in degrees, everything to the last bit. How many digits of theta2 and the period are to be trusted, the
+        columns with their errors say.
+
+        Raises:
+            ValueError: another ending; no directory to write in.
+        """
+        path = Path(path)
+        check_place("path", path, (".csv", ".json"))
+        with replacing(path) as draft:
+            draft.write_text(as_json(self.record()) + "\n" if path.suffix == ".json" else self._csv())
+
+    def _about(self) -> dict[str, Any]:
+        import dpend
+
+        names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
+        return {
+            "dpend_version": dpend.__version__,
+            "pendulum": {key: float(getattr(self.pendulum, name)) for name, key in names.items()},
+            "max_period_s": self.max_period,
+            "units": dict(_UNITS),
+            "coverage": asdict(self.coverage),
+            "families": list(self.families),
+        }
+
+    def _csv(self) -> str:
+        text = io.StringIO()
+        text.write("# " + " ".join(as_json(self._about()).split()) + "\n")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([_file_name(key) for key in self.table])
+        columns = {key: _out(key, column).tolist() for key, column in self.table.items()}
+        columns["status"] = [Status(status).name.lower() for status in columns["status"]]
+        writer.writerows(zip(*columns.values(), strict=True))
+        return text.getvalue()
+
+
+def load_atlas(path: str | os.PathLike[str]) -> Atlas:
+    """The atlas that `Atlas.save` wrote to F.json or F.csv.
+
+    Raises:
+        ValueError: no such file, or one that holds no atlas.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text()
+        if path.suffix == ".csv":
+            first, _, rest = text.partition("\n")
+            about, rows = json.loads(first.removeprefix("#")), list(csv.DictReader(io.StringIO(rest)))
+        else:
+            about = json.loads(text)
+            rows = about.pop("orbits")
+            for row in rows:
+                row |= {f"dual_{key}": value for key, value in row.pop("dual").items()}
+                row |= dict(zip(("turns1", "turns2"), row.pop("turns"), strict=True))
+        table = {key: _in(key, [row[_file_name(key)] for row in rows]) for key in _COLUMNS}
+        families, coverage = tuple(about["families"]), Coverage(**about["coverage"])
+        return Atlas(Pendulum(*about["pendulum"].values()), about["max_period_s"], table, families, coverage)
+    except OSError as error:
+        raise ValueError(f"path must be a file that can be read, got {path} ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"path must be a file that Atlas.save wrote, got {path} ({error})") from None
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+_UNITS = {
+    "theta1": "deg",
+    "theta2": "deg",
+    "dual_theta1": "deg",
+    "dual_theta2": "deg",
+    "theta2_error": "deg",
+    "period": "s",
+    "period_error": "s",
+    "energy": "J",
+}
+# Columns and their types; of the columns without a unit `residual` is in rad and m2 l2 sqrt(g l2), `arclength` as in
+# `Family`.
+_COLUMNS: dict[str, type] = {
+    "family": str,
+    "arclength": float,
+    "theta1": float,
+    "theta2": float,
+    "period": float,
+    "energy": float,
+    "kappa": float,
+    "log_abs_kappa": float,
+    "symmetry": str,
+    "dual_theta1": float,
+    "dual_theta2": float,
+    "turns1": int,
+    "turns2": int,
+    "residual": float,
+    "theta2_error": float,
+    "period_error": float,
+    "iterations": int,
+    "status": int,
+}
+
+
+def _file_name(column: str) -> str:
+    return f"{column}_{_UNITS[column]}" if column in _UNITS else column
+
+
+def _out(column: str, values: np.ndarray) -> np.ndarray:
+    return np.degrees(values) if _UNITS.get(column) == "deg" else values
+
+
+def _in(column: str, values: list[Any]) -> np.ndarray:
+    if column == "status":
+        return np.array([int(Status[value.upper()]) for value in values], int)
+    kind = _COLUMNS[column]
+    array: np.ndarray = np.array(
+        [math.nan if kind is float and value is None else kind(value) for value in values], kind
+    )
+    return np.radians(array) if _UNITS.get(column) == "deg" else array
+
+
+def table_of(orbits: PeriodicOrbit, family: str, arclength: Any) -> dict[str, np.ndarray]:
+    """The rows of some orbits with a leading axis."""
+    columns = {
+        "theta1": orbits.theta1,
+        "theta2": orbits.theta2,
+        "dual_theta1": orbits.dual.theta1,
+        "dual_theta2": orbits.dual.theta2,
+        "turns1": orbits.turns[0],
+        "turns2": orbits.turns[1],
+        "theta2_error": orbits.error_estimate[0],
+        "period_error": orbits.error_estimate[1],
+    }
+    columns |= {key: getattr(orbits, key) for key in ("period", "energy", "kappa", "log_abs_kappa", "residual")}
+    columns |= {"iterations": orbits.iterations, "status": orbits.status, "arclength": arclength}
+    count = len(np.asarray(orbits.period))
+    columns |= {"family": np.full(count, family), "symmetry": np.full(count, orbits.symmetry)}
+    return {key: np.asarray(columns[key], kind) for key, kind in _COLUMNS.items()}
+
+
+def stacked(tables: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """One table below the other."""
+    return {
+        key: np.concatenate([table[key] for table in tables]) if tables else np.zeros(0, kind)
+        for key, kind in _COLUMNS.items()
+    }
+
+
+def _orbit(pendulum: Pendulum, row: dict[str, Any]) -> PeriodicOrbit:
+    return PeriodicOrbit(
+        pendulum=pendulum,
+        state=released(float(row["theta1"]), float(row["theta2"])),
+        period=float(row["period"]),
+        energy=float(row["energy"]),
+        residual=float(row["residual"]),
+        iterations=int(row["iterations"]),
+        kappa=float(row["kappa"]),
+        log_abs_kappa=float(row["log_abs_kappa"]),
+        dual=released(float(row["dual_theta1"]), float(row["dual_theta2"])),
+        turns=(int(row["turns1"]), int(row["turns2"])),
+        error_estimate=(float(row["theta2_error"]), float(row["period_error"])),
+        status=int(row["status"]),
+        symmetry=str(row["symmetry"]),
+    )
+
+
+def _range(name: str, bounds: Any) -> tuple[float, float]:
+    try:
+        low, high = (float(bound) for bound in bounds)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a pair (low, high), got {bounds!r}") from None
+    if not low <= high:
+        raise ValueError(f"{name} must be a pair (low, high) with low at most high, got {bounds!r}")
+    return low, high
+
+
+# --- one release angle ------------------------------------------------------------------------------------------------
+
+
+def find_brake_orbits(pendulum: Pendulum, *, theta1: float, max_period: float) -> Atlas:
+    """Every orbit released from rest at `theta1` with a period of at most `max_period`: all its partners theta2.
+
+    The returns to rest are all zeros of (p1, p2) in (theta2, t), found cell by cell (see `scan`). The scan is repeated
+    from twice as many intervals of theta2 until the number of returns has stood through two repetitions; then each
+    return is solved by `find_orbit`. An orbit run through several times is listed once with its minimal period; where
+    theta1 is 0 or 180 degrees, so is one of each pair of mirror images (theta1, theta2) and (theta1, -theta2). Where
+    both rests of an orbit, or one and the mirror image of the other, have theta1, both are listed, being two releases.
+
+    Arguments:
+        pendulum: its fields are numbers; g positive.
+        theta1: release angle of the upper rod [rad].
+        max_period: [s]. The number of orbits, and the time it takes, grows exponentially with it.
+    Returns:
+        Atlas, in order of the period; theta2 in (-pi, pi].
+    Raises:
+        ValueError: theta1 not finite, max_period not positive, g not positive, a traced argument.
+        RuntimeError: float64 is switched off in JAX.
+    """
+    require_float64()
+    fixed = known_pendulum(pendulum)
+    theta1 = float(number("theta1", theta1, unit="rad"))
+    max_period = float(number("max_period", max_period, positive=True, unit="s"))
+    counts: list[int] = []
+    for refinement in range(_MOST_REFINEMENTS + 1):
+        result = returns(fixed, theta1, max_period, _INTERVALS << refinement)
+        counts.append(len(result.zeros))
+        if len(counts) > 2 and counts[-3:] == counts[-1:] * 3:
+            break
+    found, lost = _solved(fixed, theta1, max_period, result)
+    coverage = Coverage(
+        theta2_points=result.motions,
+        time_points=result.rows,
+        refinements=refinement,
+        suspicious_cells=len(result.open_cells) + lost,
+        winding=result.winding,
+        degree=result.degree,
+    )
+    return Atlas(fixed, max_period, stacked([_row(orbit) for orbit in found]), (), coverage)
+
+
+def returns(pendulum: Pendulum, theta1: float, max_period: float, intervals: int) -> Scan:
+    """All returns to rest within half of `max_period`, times in seconds."""
+    second = math.sqrt(pendulum.l1 / pendulum.g)
+    scaled = jax.tree.map(float, natural(pendulum))
+    half = 0.5 * max_period / second * (1 + _BEYOND)
+    result = scanned(scaled, math.remainder(theta1, 2 * math.pi), half, intervals)
+    zeros = tuple(zero._replace(time=zero.time * second, row=zero.row * second) for zero in result.zeros)
+    return replace(result, zeros=zeros)
+
+
+def _solved(pendulum: Pendulum, theta1: float, max_period: float, result: Scan) -> tuple[list[PeriodicOrbit], int]:
+    """The orbits to which the returns belong, in order of the period, and the number that Newton's method lost."""
+    found: list[PeriodicOrbit] = []
+    lost = 0
+    own_mirror = abs(math.sin(theta1)) < 1e-12
+    for zero in sorted(result.zeros, key=lambda zero: zero.time):
+        if (own_mirror and zero.theta2 < 0) or any(is_return(orbit, zero) for orbit in found):
+            continue
+        orbit = find_orbit(pendulum, theta1, guess=(zero.theta2, 2 * zero.time))
+        if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
+            lost += 1
+        elif float(orbit.period) <= max_period * (1 + 1e-12):
+            found.append(orbit)
+    return sorted(found, key=lambda orbit: float(orbit.period)), lost
+
+
+# A return is known to this share of its cell.
+_LOCATED = 0.2
+
+
+def is_return(orbit: PeriodicOrbit, zero: Zero) -> bool:
+    """Whether a return to rest is that of an orbit, maybe run through several times."""
+    apart = abs(math.remainder(float(orbit.theta2) - zero.theta2, 2 * math.pi))
+    half = 0.5 * float(orbit.period)
+    late = abs(zero.time - half * max(1, round(zero.time / half)))
+    return apart < max(_LOCATED * zero.width, 1e-12) and late < _LOCATED * zero.row
+
+
+def _row(orbit: PeriodicOrbit) -> dict[str, np.ndarray]:
+    return table_of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], orbit), "", np.full(1, np.nan))

@@ -1,0 +1,455 @@
+"""Every return to rest of one release angle: all zeros of the momenta on the rectangle of theta2 and time.
+
+With theta1 given, G(theta2, t) = p(t)/t of the motion released at (theta1, theta2) is a smooth map of a rectangle to
+the plane, and its zeros are the brake orbits; the division takes away the line t = 0, where every motion is at rest.
+Lanes of motions with their tangent in theta2 give G, both its slopes and the mixed derivative on a grid, from which
+each cell has its bicubic; by the convex hull of a bicubic's Bernstein coefficients a cell is told to be one of
+
+- empty: the hull lies to one side of zero;
+- simple: after multiplication with the inverse of its mean, the derivative is near enough to the unit matrix
+  everywhere that the map is one to one: one zero at most, and Newton's method says whether it is there;
+- neither: it is halved in time if it is bent more that way, else its interval of theta2 is.
+
+All of it holds up to the error of the bicubic, which is measured wherever an interval is halved and in every row, and
+kept clear of. What remains open at the narrowest interval is told as suspicious. And there is a count that knows
+nothing of cells: G(theta2, 0) does not go round zero, so that the signs of all zeros must add up to the winding number
+of p at the last time as theta2 goes once round.
+
+In natural units, and in NumPy but for the lanes.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from dpend.lanes import over_lanes
+from dpend.pendulum import Pendulum, State, fast_frequency, vector_field
+from dpend.steppers import Scheme
+
+# The stages as a loop: motions are few and of many kinds, and compiling would take longer than all of them.
+_METHOD = Scheme("rk8-circle", 1.0, written_out=False)
+# Rows that one launch computes.
+_WINDOW = 64
+# The first guess of the time between rows: the fast mode advances by this [rad].
+_ROW = 0.05
+# Where a cell that may hold a zero has an error along time above this share of its height, all rows are laid denser,
+# so many times at most.
+_COARSE, _DENSER = 0.02, 6
+# Intervals of theta2 looked at together: as many as fit a cache.
+_BATCH = 512
+# Intervals [rad] narrower than this are not halved: rounding, magnified as the tangent is, would be all there is.
+_NARROWEST = 1e-11
+# The share of the measured error that is kept clear of: halving an interval takes a cubic's error down sixteen times.
+_CLEARANCE = 0.25
+# A cell that is bent in time more than in theta2, as near a fold, is halved in time, so often at most.
+_SPLITS = 12
+# How far from the unit matrix a derivative may be.
+_DOMINANCE = 0.9
+# A zero this far outside its cell, as a share of it, still counts, for the bicubic's may be off. Two of the same sign
+# that are nearer than the second to each other are one, found from both sides of an edge.
+_EDGE, _SAME = 0.02, 0.1
+
+
+class Zero(NamedTuple):
+    """A return to rest: the release, the time, the sign of the Jacobian of (p1, p2) in (theta2, t), and the width in
+    theta2 and the time between rows of the cell that it was found in.
+    """
+
+    theta2: float
+    time: float
+    sign: float
+    width: float
+    row: float
+
+
+@dataclass(frozen=True)
+class Scan:
+    """All zeros on the rectangle.
+
+    Attributes:
+        zeros: in order of theta2.
+        motions: how many were integrated.
+        rows: how many times each was looked at.
+        open_cells: (theta2, width) of intervals that were left undecided.
+        winding: of p at the last time as theta2 goes round, clockwise: the way round the rectangle that keeps it left.
+    """
+
+    zeros: tuple[Zero, ...]
+    motions: int
+    rows: int
+    open_cells: tuple[tuple[float, float], ...]
+    winding: int
+
+    @property
+    def degree(self) -> int:
+        """The sum of the zeros' signs, which is the winding number if none is missing."""
+        return round(sum(zero.sign for zero in self.zeros))
+
+
+class _Intervals(NamedTuple):
+    """Intervals of theta2 and G at their ends: value, slopes in time and theta2, and mixed, shape (4, 2, rows, n)."""
+
+    left: np.ndarray
+    right: np.ndarray
+    at_left: np.ndarray
+    at_right: np.ndarray
+
+    def some(self, which: Any) -> "_Intervals":
+        return _Intervals(self.left[which], self.right[which], self.at_left[..., which], self.at_right[..., which])
+
+
+class _TooCoarse(Exception):
+    """The rows lie too far apart for the motion."""
+
+
+def scanned(pendulum: Pendulum, theta1: float, duration: float, intervals: int) -> Scan:
+    """All returns to rest up to `duration`, from so many intervals of theta2 to begin with.
+
+    Arguments:
+        pendulum: in natural units, its fields numbers; so is the duration.
+        theta1: [rad].
+    """
+    spacing = _ROW / float(fast_frequency(pendulum))
+    for _ in range(_DENSER):
+        rows = _WINDOW * math.ceil(duration / spacing / _WINDOW)
+        try:
+            return _Scanner(pendulum, theta1, duration / rows, rows, coarse=False).run(intervals)
+        except _TooCoarse:
+            spacing = 0.5 * duration / rows
+    return _Scanner(pendulum, theta1, duration / rows, rows, coarse=True).run(intervals)
+
+
+@dataclass(frozen=True)
+class _Scanner:
+    """The rectangle and its rows."""
+
+    pendulum: Pendulum
+    theta1: float
+    dt: float
+    rows: int
+    coarse: bool  # whether rows too far apart are put up with
+
+    def run(self, intervals: int) -> Scan:
+        edges = np.linspace(-np.pi, np.pi, intervals + 1)
+        zeros: list[Zero] = []
+        open_cells: list[tuple[float, float]] = []
+        motions, turned = 0, 0.0
+        waiting: list[Any] = [edges[i : i + _BATCH + 1] for i in range(0, intervals, _BATCH)][::-1]
+        while waiting:
+            some = self._taken(waiting)
+            if isinstance(some, np.ndarray):  # edges whose motions are not known yet
+                known = self.motions(some)
+                motions += len(some)
+                some = _Intervals(some[:-1], some[1:], known[..., :-1], known[..., 1:])
+            for half in self._halved(some):
+                found, undecided = self._looked_at(half.intervals, half.error)
+                wide = half.intervals.right - half.intervals.left > _NARROWEST
+                zeros += found
+                again = half.intervals.some(np.flatnonzero(undecided & wide))
+                waiting += [again.some(slice(i, i + _BATCH)) for i in range(0, len(again.left), _BATCH)]
+                left = half.intervals.some(np.flatnonzero(undecided & ~wide))
+                open_cells += zip(left.left.tolist(), (left.right - left.left).tolist(), strict=True)
+                settled = half.intervals.some(np.flatnonzero(~(undecided & wide)))
+                turned += _turned(settled)
+            motions += len(some.left)
+        return Scan(_distinct(zeros, self.dt), motions, self.rows + 1, tuple(open_cells), round(turned / (2 * np.pi)))
+
+    def _taken(self, waiting: list[Any]) -> Any:
+        """The next edges, or as many intervals as fit a batch."""
+        if isinstance(waiting[-1], np.ndarray):
+            return waiting.pop()
+        parts = [waiting.pop()]
+        while waiting and isinstance(waiting[-1], _Intervals) and sum(len(p.left) for p in parts) < _BATCH // 2:
+            parts.append(waiting.pop())
+        return _Intervals(*(np.concatenate(columns, axis=-1) for columns in zip(*parts, strict=True)))
+
+    def motions(self, theta2: np.ndarray) -> np.ndarray:
+        """G of the motions released at (theta1, theta2), shape (4, 2, rows + 1, n)."""
+        zero = np.zeros_like(theta2)
+        each = State(zero + self.theta1, theta2, zero, zero), State(zero, zero + 1, zero, zero)
+        shared = jax.tree.map(float, (self.pendulum, self.dt))
+        parts = [_at_rest(self.pendulum, self.theta1, theta2)]
+        for _ in range(self.rows // _WINDOW):
+            each, rows = over_lanes(_window, shared, each)
+            parts.append(np.swapaxes(rows, 0, 1))
+        table = np.concatenate(parts, axis=1).reshape(4, 2, self.rows + 1, -1)
+        table /= np.array([1 + self.pendulum.m2, self.pendulum.m2 * self.pendulum.l2**1.5])[:, None, None]
+        time = self.dt * np.arange(1, self.rows + 1)[:, None]
+        for value, slope in ((0, 1), (2, 3)):
+            table[value, :, 1:] /= time
+            table[slope, :, 1:] = (table[slope, :, 1:] - table[value, :, 1:]) / time
+        return _without_equilibria(table, theta2) if abs(math.sin(self.theta1)) < _AT_EQUILIBRIUM else table
+
+    def _halved(self, some: _Intervals) -> "tuple[_Half, _Half]":
+        """Both halves of all intervals, and how far the middles are from what the whole ones foretold."""
+        middle = 0.5 * (some.left + some.right)
+        there = self.motions(middle)
+        width = some.right - some.left
+        foretold = 0.5 * (some.at_left[0] + some.at_right[0]) + width / 8 * (some.at_left[2] - some.at_right[2])
+        error = _CLEARANCE * np.max(np.abs(foretold - there[0]), axis=0)
+        error = np.maximum(error[:-1], error[1:])
+        return (
+            _Half(_Intervals(some.left, middle, some.at_left, there), error),
+            _Half(_Intervals(middle, some.right, there, some.at_right), error),
+        )
+
+    def _looked_at(self, some: _Intervals, error: np.ndarray) -> tuple[list[Zero], np.ndarray]:
+        """The zeros in the cells of these intervals, and in which intervals a cell is undecided."""
+        row, lane = np.nonzero(self._maybe(some, error))
+        undecided = np.zeros(len(some.left), bool)
+        if not row.size:
+            return [], undecided
+        net = _net(some, row, lane, self.dt)
+        along_time = self._error_in_time(some, row, lane)
+        height = np.max(np.abs(net[:, -1] - net[:, 0]), axis=(0, 1))
+        if not self.coarse and np.any(along_time > _COARSE * height):
+            raise _TooCoarse
+        zeros: list[Zero] = []
+        cells = _Cells(net, error[row, lane] + along_time, np.arange(row.size), np.zeros(row.size))
+        for split in range(_SPLITS + 1):
+            with np.errstate(all="ignore"):
+                told = cells.told()
+            whole = cells.whole[told.simple]
+            width = (some.right - some.left)[lane[whole]]
+            theta2 = some.left[lane[whole]] + told.where[0] * width
+            time = self.dt * (row[whole] + cells.start[told.simple] + told.where[1] / 2**split)
+            table = np.stack([theta2, time, told.sign, width, np.full_like(time, self.dt)], axis=1)
+            inside = np.all((told.where > -_EDGE) & (told.where < 1 + _EDGE), axis=0)
+            zeros += [Zero(*each) for each in table[inside].tolist()]
+            late = cells.bent_in_time(told.open) & (split < _SPLITS)
+            undecided[lane[cells.whole[told.open[~late]]]] = True
+            again = told.open[late]
+            again = again[~undecided[lane[cells.whole[again]]]]
+            if not again.size:
+                break
+            cells = cells.halved(again, split)
+        return zeros, undecided
+
+    def _maybe(self, some: _Intervals, error: np.ndarray) -> np.ndarray:
+        """The cells that a bound too simple to be sharp cannot tell to be empty, shape (rows, n)."""
+        width, dt = (some.right - some.left) / 3, self.dt / 3
+        corners = [end[:, :, rows] for end in (some.at_left, some.at_right) for rows in (slice(-1), slice(1, None))]
+        middle = sum(corner[0] for corner in corners)
+        towards = middle / np.maximum(np.hypot(*middle), np.finfo(float).tiny)
+        lowest = np.full(towards.shape[1:], np.inf)
+        for corner in corners:
+            value, by_time, by_angle, mixed = corner[:, 0] * towards[0] + corner[:, 1] * towards[1]
+            reach = dt * np.abs(by_time) + width * np.abs(by_angle) + dt * width * np.abs(mixed)
+            np.minimum(lowest, value - reach, out=lowest)
+        return ~(lowest > 1.5 * error)
+
+    def _error_in_time(self, some: _Intervals, row: np.ndarray, lane: np.ndarray) -> np.ndarray:
+        """What the cubics along time miss, from every other row."""
+        missed = np.zeros(row.size)
+        for middle in (row, row + 1):
+            middle = np.clip(middle, 1, self.rows - 1)
+            for end in (some.at_left, some.at_right):
+                before, here, after = (end[:2, :, middle + k, lane] for k in (-1, 0, 1))
+                foretold = 0.5 * (before[0] + after[0]) + self.dt / 4 * (before[1] - after[1])
+                missed = np.maximum(missed, np.max(np.abs(foretold - here[0]), axis=0))
+        return missed / 16
+
+
+class _Half(NamedTuple):
+    intervals: _Intervals
+    error: np.ndarray  # of the cells' values, shape (rows, n)
+
+
+def _net(some: _Intervals, row: np.ndarray, lane: np.ndarray, dt: float) -> np.ndarray:
+    """Bernstein coefficients of the bicubics over cells, axes (theta2, time, component, cell)."""
+    width = (some.right - some.left)[lane] / 3
+    net = np.empty((4, 4, 2, row.size))
+    for end, i, inner_i, right in ((some.at_left, 0, 1, width), (some.at_right, 3, 2, -width)):
+        for at, j, inner_j, up in ((row, 0, 1, dt / 3), (row + 1, 3, 2, -dt / 3)):
+            value, by_time, by_angle, mixed = end[:, :, at, lane]
+            net[i, j] = value
+            net[inner_i, j] = value + right * by_angle
+            net[i, inner_j] = value + up * by_time
+            net[inner_i, inner_j] = value + right * by_angle + up * by_time + right * up * mixed
+    return net
+
+
+class _Cells(NamedTuple):
+    """Bicubics over cells, or over parts of cells that were halved in time.
+
+    Attributes:
+        net: Bernstein coefficients, axes (theta2, time, component, part).
+        error: of the values.
+        whole: the cell that a part belongs to.
+        start: where in time it begins, as a share of the cell.
+    """
+
+    net: np.ndarray
+    error: np.ndarray
+    whole: np.ndarray
+    start: np.ndarray
+
+    def told(self) -> "_Told":
+        by_angle, by_time = 3 * (self.net[1:] - self.net[:-1]), 3 * (self.net[:, 1:] - self.net[:, :-1])
+        across, along = by_angle.mean(axis=(0, 1)), by_time.mean(axis=(0, 1))
+        determinant = across[0] * along[1] - across[1] * along[0]
+        inverse = np.array([[along[1], -along[0]], [-across[1], across[0]]]) / determinant
+        error = np.abs(inverse).sum(axis=1) * self.error
+        value = _product(inverse, self.net)
+        below, above = np.max(value, axis=(0, 1)) + error < 0, np.min(value, axis=(0, 1)) - error > 0
+        (left,) = np.nonzero(~np.any(below | above, axis=0))
+        by_angle, by_time = (_product(inverse[..., left], net[..., left]) for net in (by_angle, by_time))
+
+        def worst(net: np.ndarray) -> np.ndarray:
+            return np.max(np.abs(net), axis=(0, 1))
+
+        apart = np.maximum(
+            worst(by_angle[:, :, 0] - 1) + worst(by_time[:, :, 0]),
+            worst(by_angle[:, :, 1]) + worst(by_time[:, :, 1] - 1),
+        )
+        # A cubic's slope is wrong by up to four times its value's error, at either end.
+        near = apart + 8 * np.max(error[:, left], axis=0) < _DOMINANCE
+        simple = left[near]
+        return _Told(left[~near], simple, _zero_of(value[..., simple]), np.sign(determinant[simple]))
+
+    def bent_in_time(self, which: np.ndarray) -> np.ndarray:
+        """Whether parts are further from linear in time than in theta2."""
+        net = self.net[..., which]
+        bent = (np.max(np.abs(np.diff(net, 2, axis=axis)), axis=(0, 1, 2)) for axis in (0, 1))
+        across, along = bent
+        return np.asarray(along > across)
+
+    def halved(self, which: np.ndarray, split: int) -> "_Cells":
+        """Both halves in time, by de Casteljau's construction, of parts halved `split` times before."""
+        a, b, c, d = np.moveaxis(self.net[..., which], 1, 0)
+        ab, bc, cd = (a + b) / 2, (b + c) / 2, (c + d) / 2
+        abc, bcd = (ab + bc) / 2, (bc + cd) / 2
+        middle = (abc + bcd) / 2
+        halves = np.stack([a, ab, abc, middle], axis=1), np.stack([middle, bcd, cd, d], axis=1)
+        start = self.start[which]
+        return _Cells(
+            np.concatenate(halves, axis=-1),
+            np.tile(self.error[which], 2),
+            np.tile(self.whole[which], 2),
+            np.concatenate([start, start + 0.5 ** (split + 1)]),
+        )
+
+
+class _Told(NamedTuple):
+    """Which parts are open, being neither empty nor simple, and which simple; where these have their zero, in units of
+    their sides, and its sign.
+    """
+
+    open: np.ndarray
+    simple: np.ndarray
+    where: np.ndarray
+    sign: np.ndarray
+
+
+def _product(matrix: np.ndarray, net: np.ndarray) -> np.ndarray:
+    """A matrix for each cell times the components of a net."""
+    return np.stack([row[0] * net[:, :, 0] + row[1] * net[:, :, 1] for row in matrix], axis=2)
+
+
+def _zero_of(net: np.ndarray) -> np.ndarray:
+    """Newton's method for the zero of bicubics that are near the identity plus a shift, shape (2, cells)."""
+    x = np.full((2, net.shape[-1]), 0.5)
+    for _ in range(_NEWTON):
+        (a, slope_a), (b, slope_b) = (_bernstein(each) for each in x)
+        rows, slopes = np.sum(net * b[:, None], axis=1), np.sum(net * slope_b[:, None], axis=1)
+        value, across = np.sum(a[:, None] * rows, axis=0), np.sum(slope_a[:, None] * rows, axis=0)
+        along = np.sum(a[:, None] * slopes, axis=0)
+        determinant = across[0] * along[1] - across[1] * along[0]
+        x[0] -= (along[1] * value[0] - along[0] * value[1]) / determinant
+        x[1] -= (across[0] * value[1] - across[1] * value[0]) / determinant
+        np.clip(x, -1.0, 2.0, out=x)
+    return x
+
+
+_NEWTON = 12
+
+
+def _bernstein(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The cubic Bernstein polynomials and their derivatives, shape (4, n) each."""
+    y = 1 - x
+    values = np.array([y**3, 3 * x * y**2, 3 * x**2 * y, x**3])
+    return values, 3 * np.array([-(y**2), y**2 - 2 * x * y, 2 * x * y - x**2, x**2])
+
+
+def _turned(some: _Intervals) -> float:
+    """How far p at the last time turns clockwise about zero over these intervals, less than half a circle in each."""
+    start, end = some.at_left[0, :, -1], some.at_right[0, :, -1]
+    cross, dot = start[0] * end[1] - start[1] * end[0], np.sum(start * end, axis=0)
+    return -float(np.sum(np.arctan2(cross, dot)))
+
+
+# --- motions ----------------------------------------------------------------------------------------------------------
+
+
+def _window(shared: tuple[Pendulum, Any], each: tuple[State, State]) -> tuple[tuple[State, State], Any]:
+    """A motion and its tangent _WINDOW rows later, and on the way p, p', and their tangents, shape (_WINDOW, 8)."""
+    pendulum, dt = shared
+    constants = _METHOD.constants(pendulum, dt)
+
+    def step(carry: Any, _: None) -> Any:
+        point, tangent = _METHOD.move_tangents(constants, *carry)
+        return (point, tangent), _row(pendulum, _METHOD.leave(constants, point), tangent)
+
+    start = _METHOD.enter(pendulum, each[0]), each[1]
+    (point, tangent), rows = lax.scan(step, start, None, length=_WINDOW)
+    return (_METHOD.leave(constants, point), tangent), rows
+
+
+def _row(pendulum: Pendulum, state: State, tangent: State) -> Any:
+    rate, change = jax.jvp(partial(vector_field, pendulum), (state,), (tangent,))
+    return jnp.stack([state.p1, state.p2, rate.p1, rate.p2, tangent.p1, tangent.p2, change.p1, change.p2])
+
+
+def _at_rest(pendulum: Pendulum, theta1: float, theta2: np.ndarray) -> np.ndarray:
+    """The rows at t = 0 as G has them there: p/t tends to p', whose slope in time vanishes; shape (8, 1, n)."""
+    force1 = -(pendulum.m1 + pendulum.m2) * pendulum.g * pendulum.l1 * math.sin(theta1)
+    force2 = -pendulum.m2 * pendulum.g * pendulum.l2
+    zero = np.zeros_like(theta2)
+    rows = [zero + force1, force2 * np.sin(theta2), zero, zero, zero, force2 * np.cos(theta2), zero, zero]
+    return np.stack(rows)[:, None]
+
+
+# Releases with the upper rod upright or hanging to within this [rad] share a column of equilibria.
+_AT_EQUILIBRIUM = 1e-12
+
+
+def _without_equilibria(table: np.ndarray, theta2: np.ndarray) -> np.ndarray:
+    """G/sin(theta2), for theta1 in {0, pi}: there G vanishes at both equilibria whatever the time, and is odd about
+    them, so that its slope takes its place and the slope's vanishes.
+    """
+    sine, cosine = np.sin(theta2), np.cos(theta2)
+    still = np.abs(sine) < _AT_EQUILIBRIUM
+    divisor = np.where(still, 1.0, sine)
+    values, slopes = table[:2], table[2:]
+    with np.errstate(all="ignore"):
+        new_values = np.where(still, slopes / cosine, values / divisor)
+        new_slopes = np.where(still, 0.0, (slopes - new_values * cosine) / divisor)
+    return np.concatenate([new_values, new_slopes])
+
+
+def _distinct(zeros: list[Zero], dt: float) -> tuple[Zero, ...]:
+    """In order of theta2 in (-pi, pi], each once: those on an edge of their cell are found from both its sides."""
+    kept: list[Zero] = []
+    for zero in sorted(zeros, key=lambda zero: zero.time):
+        theta2 = zero.theta2 - 2 * np.pi * math.ceil(zero.theta2 / (2 * np.pi) - 0.5 - 1e-12)
+        zero = zero._replace(theta2=theta2)
+        recent = itertools.takewhile(partial(_within, zero, _SAME * dt), reversed(kept))
+        if not any(_one(zero, other) for other in recent):
+            kept.append(zero)
+    return tuple(sorted(kept))
+
+
+def _within(later: Zero, time: float, earlier: Zero) -> bool:
+    return later.time - earlier.time < time
+
+
+def _one(zero: Zero, other: Zero) -> bool:
+    apart = abs(math.remainder(other.theta2 - zero.theta2, 2 * np.pi))
+    return apart < _SAME * max(zero.width, other.width) and other.sign == zero.sign

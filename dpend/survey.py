@@ -1,0 +1,349 @@
+"""The whole square: every family of brake orbits up to a period.
+
+Slices theta1 = const are scanned for all returns to rest (see `scan`), and what belongs to no known family starts a new
+one, followed both ways by continuation. Each return is held against the families' curves in (theta1, theta2, period),
+and each passage of a family through a slice against the returns: neither side may have more than the other. Slices are
+doubled until two doublings have shown no new family: one that was missed turns back twice between neighbouring slices,
+with both its rests.
+"""
+
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from dpend._runtime import require_float64
+from dpend.atlas import Atlas, Coverage, is_return, returns, stacked, table_of
+from dpend.families import Family, follow_family, known_pendulum
+from dpend.files import as_json, check_place, replacing
+from dpend.orbits import find_orbit
+from dpend.pendulum import Pendulum, number
+from dpend.scan import Zero
+from dpend.trajectory import Status
+
+# Doublings of the slices: this many to begin with, and at most so many. Slices are odd multiples of pi/2^(level + 1).
+_FIRST_LEVELS, _MOST_LEVELS = 5, 10
+# Intervals of theta2 that a slice's scan begins with; more where it leaves a doubt.
+_INTERVALS, _MORE_INTERVALS = 128, 1024
+# Points along families lie no further apart than this [arclength], so that chords between them are true to the second
+# [rad, and log of the period]: what is nearer to a chord belongs to its family.
+_STEP, _NEAR = 0.02, 3e-3
+
+
+def find_brake_families(
+    pendulum: Pendulum,
+    *,
+    max_period: float,
+    store: str | os.PathLike[str] | None = None,
+    progress: Callable[[int, int, int], None] | None = None,
+) -> Atlas:
+    """Every family of orbits released from rest with a period of at most `max_period`, on the whole square of angles.
+
+    An orbit and its dual, and their mirror images, are one entry: a family is one curve of releases, and its dual
+    curve, their images under theta -> -theta, and runs through an orbit several times are the same family.
+
+    Arguments:
+        pendulum: its fields are numbers; g positive.
+        max_period: [s]. The number of families, and the time it takes, grows exponentially with it.
+        store: F.json, written after every slice; a search that was stopped goes on from there.
+        progress: called with slices done, slices planned so far, and families found, after every slice.
+    Returns:
+        Atlas, family by family, in order of arclength from the end with the shorter period. Families are called C1, C2
+        (centred) and B1, B2 (brake) in order of their shortest period, so that a name does not depend on how a family
+        was found, nor on `max_period`. Their records: `family`, `symmetry`, `ends` as in `Family` (`longest period`
+        where it goes on beyond max_period), `shortest_period_s` and `longest_period_s` within, `special_points` with
+        kind, arclength, release in degrees, period and kappa.
+    Raises:
+        ValueError: max_period not positive, g not positive, a traced argument; a store made with other settings.
+        RuntimeError: float64 is switched off in JAX.
+    """
+    require_float64()
+    fixed = known_pendulum(pendulum)
+    max_period = float(number("max_period", max_period, positive=True, unit="s"))
+    survey = _Survey(fixed, max_period)
+    if store is not None:
+        survey = _resumed(survey, Path(store))
+    for level in range(_MOST_LEVELS):
+        angles = np.pi * (2 * np.arange(2**level) + 1) / 2 ** (level + 1)
+        planned = 2 ** (max(level + 1, _FIRST_LEVELS)) - 1
+        for angle in angles.tolist():
+            if angle not in survey.slices:
+                survey.look_at(angle, level)
+                if store is not None:
+                    _keep(survey, Path(store))
+            if progress is not None:
+                progress(len(survey.slices), planned, len(survey.tracks))
+        newest = max((track.level for track in survey.tracks), default=0)
+        if level + 1 >= _FIRST_LEVELS and level - newest >= 2:
+            break
+    return survey.atlas(level)
+
+
+# --- families as curves of releases -----------------------------------------------------------------------------------
+
+
+class _Hit(NamedTuple):
+    """A slice's return to rest."""
+
+    zero: Zero
+    theta1: float
+
+
+@dataclass(frozen=True)
+class _Track:
+    """A family, how it was found, and all its curves of releases: as it is, at the other rest, and in the mirror.
+
+    Attributes:
+        seed: the release (theta1, theta2) and period that it was followed from.
+        level: of the slice that it was found on.
+        chords: (theta1, theta2, log of the period) at their beginnings and ends, shape (n, 2, 3).
+    """
+
+    family: Family
+    seed: tuple[float, float, float]
+    level: int
+    chords: np.ndarray
+
+    @staticmethod
+    def of(family: Family, seed: tuple[float, float, float], level: int) -> "_Track":
+        orbits = family.orbits
+        time = np.log(np.asarray(orbits.period))
+        own, other = (
+            np.column_stack([np.asarray(x.theta1), np.asarray(x.theta2), time]) for x in (orbits.state, orbits.dual)
+        )
+        flip = np.array([-1.0, -1.0, 1.0])
+        curves = [own, own * flip] + ([other, other * flip] if family.symmetry == "brake" else [])
+        chords = [np.stack([curve[:-1], curve[1:]], axis=1) for curve in curves]
+        # Beyond a branch point a curve goes on with its own orbits at their other rests, in the mirror or not.
+        for end, place in zip(family.ends, (0, -1), strict=True):
+            if end == "branch point":
+                chords.append(_bridges(own[place], np.stack([other[place], -other[place]])))
+                chords.append(chords[-1] * flip)
+        return _Track(family, seed, level, np.concatenate(chords))
+
+    def away(self, release: np.ndarray) -> float:
+        """How far a point (theta1, theta2, log of the period) is from the nearest chord."""
+        start, end = self.chords[:, 0], self.chords[:, 1]
+        to = release - start
+        to[:, :2] -= 2 * np.pi * np.round(to[:, :2] / (2 * np.pi))
+        way = end - start
+        share = np.clip(np.sum(to * way, axis=1) / np.maximum(np.sum(way * way, axis=1), 1e-300), 0.0, 1.0)
+        return float(np.min(np.linalg.norm(to - share[:, None] * way, axis=1)))
+
+    def passages(self, theta1: float) -> np.ndarray:
+        """(theta2, period) where it passes a slice, shape (n, 2); one through a chord's end may count twice."""
+        start, end = self.chords[:, 0], self.chords[:, 1]
+        turns = np.round((start[:, 0] - theta1) / (2 * np.pi))
+        before, after = start[:, 0] - theta1 - 2 * np.pi * turns, end[:, 0] - theta1 - 2 * np.pi * turns
+        (index,) = np.nonzero((before < 0) != (after < 0))
+        share = before[index] / (before[index] - after[index])
+        point = start[index] + share[:, None] * (end[index] - start[index])
+        return np.column_stack([point[:, 1], np.exp(point[:, 2])])
+
+
+def _bridges(point: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """The chord from a curve's end to the nearer of two images of it, shape (1, 2, 3)."""
+    way = images[:, :2] - point[:2]
+    way -= 2 * np.pi * np.round(way / (2 * np.pi))
+    nearer = way[np.argmin(np.linalg.norm(way, axis=1))]
+    return np.stack([point, point + np.append(nearer, 0.0)])[None]
+
+
+# --- the search -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Slice:
+    """What was found at one theta1."""
+
+    motions: int
+    rows: int
+    open_cells: int
+    winding: int
+    degree: int
+    returns: list[list[float]]
+    lost: int = 0
+
+
+@dataclass
+class _Survey:
+    """The search so far."""
+
+    pendulum: Pendulum
+    max_period: float
+    slices: dict[float, _Slice] = field(default_factory=dict)
+    tracks: list[_Track] = field(default_factory=list)
+
+    def look_at(self, theta1: float, level: int) -> None:
+        """Scans a slice, and follows what belongs to no family yet."""
+        result = returns(self.pendulum, theta1, self.max_period, _INTERVALS)
+        if result.open_cells or result.degree != result.winding:
+            result = returns(self.pendulum, theta1, self.max_period, _MORE_INTERVALS)
+        zeros = sorted(result.zeros, key=lambda zero: zero.time)
+        found = _Slice(
+            result.motions, result.rows, len(result.open_cells), result.winding, result.degree,
+            [[zero.theta2, 2 * zero.time] for zero in zeros],
+        )  # fmt: skip
+        for zero in zeros:
+            if 2 * zero.time <= self.max_period and not self._known(theta1, zero.theta2, 2 * zero.time):
+                found.lost += not self._follow(theta1, zero, level)
+        self.slices[theta1] = found
+
+    def _known(self, theta1: float, theta2: float, period: float) -> bool:
+        """Whether a return is that of a known family, run through once or several times."""
+        for track in self.tracks:
+            shortest = float(np.exp(np.min(track.chords[:, :, 2])))
+            for cover in range(1, int(period / shortest + 1e-3) + 1):
+                if track.away(np.array([theta1, theta2, math.log(period / cover)])) < _NEAR:
+                    return True
+        return False
+
+    def _follow(self, theta1: float, zero: Zero, level: int) -> bool:
+        """Follows the family of a return; whether that worked."""
+        seed = theta1, zero.theta2, 2 * zero.time
+        orbit = find_orbit(self.pendulum, theta1, guess=seed[1:])
+        if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
+            return False
+        self.tracks.append(self._track(seed, level))
+        return self._known(*seed)
+
+    def _track(self, seed: tuple[float, float, float], level: int) -> _Track:
+        orbit = find_orbit(self.pendulum, seed[0], guess=seed[1:])
+        longest = max(self.max_period, float(orbit.period))
+        family = follow_family(self.pendulum, orbit, longest_step=_STEP, longest_period=longest)
+        return _Track.of(family, seed, level)
+
+    def unanswered(self) -> list[tuple[float, float, float]]:
+        """Passages of families through slices where no return to rest was found: (theta1, theta2, period)."""
+        missing = []
+        for theta1, found in self.slices.items():
+            seen = np.array(found.returns).reshape(-1, 2)
+            for track in self.tracks:
+                for theta2, period in track.passages(theta1):
+                    if period > self.max_period * (1 - _NEAR):
+                        continue
+                    apart = theta2 - seen[:, 0]
+                    apart -= 2 * np.pi * np.round(apart / (2 * np.pi))
+                    if not np.any(np.hypot(apart, np.log(period / seen[:, 1])) < 3 * _NEAR):
+                        missing.append((theta1, float(theta2), float(period)))
+        return missing
+
+    def atlas(self, level: int) -> Atlas:
+        entries = [_entry(track.family, self.max_period) for track in self.tracks]
+        entries.sort(key=lambda entry: entry[1]["shortest_period_s"])
+        numbers = {"centred": 0, "brake": 0}
+        tables, records = [], []
+        for table, record in entries:
+            numbers[record["symmetry"]] += 1
+            name = f"{record['symmetry'][0].upper()}{numbers[record['symmetry']]}"
+            tables.append(table | {"family": np.full(len(table["period"]), name)})
+            records.append({"family": name} | record)
+        every = self.slices.values()
+        coverage = Coverage(
+            theta2_points=sum(one.motions for one in every),
+            time_points=max(one.rows for one in every),
+            refinements=level,
+            suspicious_cells=sum(one.open_cells + one.lost for one in every) + len(self.unanswered()),
+            winding=sum(one.winding for one in every),
+            degree=sum(one.degree for one in every),
+            slices=len(self.slices),
+        )
+        return Atlas(self.pendulum, self.max_period, stacked(tables), tuple(records), coverage)
+
+
+def _entry(family: Family, max_period: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The rows of a family within the longest period, and its record; turned and mirrored into a standard form."""
+    orbits = jax.tree.map(np.asarray, family.orbits)
+    period = np.asarray(orbits.period)
+    back = period[0] > period[-1]
+    order = slice(None, None, -1) if back else slice(None)
+    arclength = np.asarray(family.arclength)
+    start = arclength[-1] if back else arclength[0]
+    table = {key: column[order] for key, column in table_of(orbits, "", np.abs(arclength - start)).items()}
+    least = int(np.argmin(table["period"]))
+    sign = -1 if math.remainder(table["theta1"][least], 2 * math.pi) < 0 else 1
+    turns = np.round(sign * table["theta1"][least] / (2 * np.pi)), np.round(sign * table["theta2"][least] / (2 * np.pi))
+    for number_, shift in zip((1, 2), turns, strict=True):
+        for key in (f"theta{number_}", f"dual_theta{number_}"):
+            table[key] = sign * table[key] - 2 * np.pi * shift
+        centred = family.symmetry == "centred"
+        table[f"turns{number_}"] = sign * table[f"turns{number_}"] - (2 * int(shift) if centred else 0)
+    inside = table["period"] <= max_period * (1 + 1e-12)
+    kept = {key: column[inside] for key, column in table.items()}
+    record = {
+        "symmetry": family.symmetry,
+        "ends": list(family.ends[::-1] if back else family.ends),
+        "status": Status(int(family.status)).name.lower(),
+        "shortest_period_s": float(kept["period"].min()),
+        "longest_period_s": float(kept["period"].max()),
+        "special_points": [
+            {
+                "kind": _seen_from_the_other_end(point.kind) if back else point.kind,
+                "arclength": abs(float(point.arclength - start)),
+                "theta1_deg": math.degrees(sign * float(point.orbit.theta1) - 2 * math.pi * turns[0]),
+                "theta2_deg": math.degrees(sign * float(point.orbit.theta2) - 2 * math.pi * turns[1]),
+                "period_s": float(point.orbit.period),
+                "kappa": float(point.orbit.kappa),
+            }
+            for point in family.special_points[order]
+            if float(point.orbit.period) <= max_period
+        ],
+    }
+    return kept, record
+
+
+def _seen_from_the_other_end(kind: str) -> str:
+    return {"stability_lost": "stability_gained", "stability_gained": "stability_lost"}.get(kind, kind)
+
+
+# --- the store --------------------------------------------------------------------------------------------------------
+
+
+def _settings(survey: _Survey) -> dict[str, Any]:
+    import dpend
+
+    return {
+        "dpend_version": dpend.__version__,
+        "pendulum": {name: float(value) for name, value in vars(survey.pendulum).items()},
+        "max_period": survey.max_period,
+    }
+
+
+def _keep(survey: _Survey, path: Path) -> None:
+    record = {
+        "settings": _settings(survey),
+        "slices": [{"theta1": theta1} | asdict(found) for theta1, found in survey.slices.items()],
+        "families": [{"seed": list(track.seed), "level": track.level} for track in survey.tracks],
+    }
+    with replacing(path) as draft:
+        draft.write_text(as_json(record) + "\n")
+
+
+def _resumed(survey: _Survey, path: Path) -> _Survey:
+    """The search as a store left it."""
+    check_place("store", path, (".json",))
+    if not path.exists():
+        return survey
+    try:
+        record = json.loads(path.read_text())
+        settings, slices, families = (record[key] for key in ("settings", "slices", "families"))
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(
+            f"store must be a file that find_brake_families wrote, got {path}: give another name"
+        ) from None
+    if settings != _settings(survey):
+        wrong = next(key for key, value in _settings(survey).items() if settings.get(key) != value)
+        raise ValueError(
+            f"store must have been made with the same settings, got {path} with {wrong} {settings.get(wrong)}: "
+            "give another name"
+        )
+    for family in families:
+        survey.tracks.append(survey._track(tuple(family["seed"]), family["level"]))
+    survey.slices |= {one.pop("theta1"): _Slice(**one) for one in slices}
+    return survey
