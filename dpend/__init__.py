@@ -5,6 +5,10 @@ Angles in radians, SI units. The public names are those below; each module's pag
 
 from dpend import _runtime as _runtime  # sets JAX up: before anything else
 from dpend import chaos as chaos
+from dpend.atlas import Atlas as Atlas
+from dpend.atlas import Coverage as Coverage
+from dpend.atlas import find_brake_orbits as find_brake_orbits
+from dpend.atlas import load_atlas as load_atlas
 from dpend.events import Crossing as Crossing
 from dpend.events import first_crossing as first_crossing
 from dpend.families import Family as Family
@@ -32,6 +36,7 @@ from dpend.stability import multipliers as multipliers
 from dpend.stability import stability_class as stability_class
 from dpend.steppers import Scheme as Scheme
 from dpend.steppers import scheme_for as scheme_for
+from dpend.survey import find_brake_families as find_brake_families
 from dpend.sweeps import sweep as sweep
 from dpend.trajectory import Status as Status
 from dpend.trajectory import Trajectory as Trajectory

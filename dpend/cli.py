@@ -149,6 +149,48 @@ def family(
 
 
 @app.command()
+def atlas(
+    max_period: Annotated[float, _numeric(help="The longest period [s].")],
+    theta1: Annotated[
+        float | None, _numeric("--theta1", help="Release angle of the upper rod [deg]; the whole square without it.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the atlas to F.csv or F.json.")] = None,
+    store: Annotated[
+        Path | None, typer.Option(help="Of the whole square: F.json, from which a search that was stopped goes on.")
+    ] = None,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """Every orbit released from rest up to a period: of one release angle, or all families of the whole square."""
+    if theta1 is not None and store is not None:
+        raise ValueError(f"store goes with the whole square, got {store} with theta1: leave out either")
+    if out is not None:
+        check_place("out", out, (".csv", ".json"))
+    pendulum = Pendulum(l1, l2, m1, m2, g)
+    if theta1 is not None:
+        found = dpend.find_brake_orbits(pendulum, theta1=_radians("theta1", theta1), max_period=max_period)
+    else:
+        with _bar(sys.stderr.isatty(), "slices") as show:
+            found = dpend.find_brake_families(
+                pendulum,
+                max_period=max_period,
+                store=store,
+                progress=lambda done, planned, families: show(done, planned),
+            )
+    if out is not None:
+        found.save(out)
+    if as_json:
+        _print_json(found.record())
+    else:
+        _print_atlas(found, theta1, out)
+    return 0 if np.all(found.table["status"] == Status.CONVERGED) else 1
+
+
+@app.command()
 def simulate(
     theta1: _Theta1,
     theta2: Annotated[float, _numeric(help="Release angle of the lower rod [deg].")],
@@ -530,6 +572,59 @@ def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None
         print(f"{record['status']}: {record['message']}")
     if out is not None:
         print(f"written to {out}")
+
+
+def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=_described(atlas.pendulum), title_justify="left", title_style="")
+    if theta1 is not None:
+        headings = ("theta2 (deg)", "period (s)", "symmetry", "stability", "kappa", "dual (deg)", "error (deg)")
+        rows = [_atlas_row(orbit) for orbit in atlas.orbits]
+    else:
+        headings = ("family", "periods (s)", "from", "to", "orbits")
+        rows = [_family_row(atlas, one) for one in atlas.families]
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in _WORDS else "right")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    seen = atlas.coverage
+    if theta1 is not None:
+        print(
+            f"{len(atlas)} orbits with theta1 = {theta1:g} deg and a period of at most {atlas.max_period:g} s;", end=" "
+        )
+    else:
+        print(f"{len(atlas.families)} families with a period of at most {atlas.max_period:g} s,", end=" ")
+        print(f"{len(atlas)} orbits on them, {seen.slices} slices;", end=" ")
+    print(f"{seen.theta2_points} motions, {seen.time_points} times")
+    agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
+    print(f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding number {agree}")
+    if out is not None:
+        print(f"written to {out}")
+
+
+_WORDS = ("symmetry", "stability", "family", "from", "to")
+
+
+def _atlas_row(orbit: PeriodicOrbit) -> tuple[str, ...]:
+    dual = f"{_degrees(orbit.dual.theta1):.4f}, {_degrees(orbit.dual.theta2):.4f}"
+    return (
+        f"{_degrees(orbit.theta2):.9f}",
+        f"{float(orbit.period):.9f}",
+        orbit.symmetry,
+        orbit.stability,
+        f"{float(orbit.kappa):.6g}",
+        dual,
+        f"{_degrees(orbit.error_estimate[0]):.0e}",
+    )
+
+
+def _family_row(atlas: dpend.Atlas, record: dict[str, Any]) -> tuple[str, ...]:
+    count = int(np.sum(atlas.table["family"] == record["family"]))
+    periods = f"{record['shortest_period_s']:.6f} - {record['longest_period_s']:.6f}"
+    return record["family"], periods, *record["ends"], str(count)
 
 
 def _described(pendulum: Pendulum) -> str:

@@ -379,10 +379,18 @@ def _bernstein(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turned(some: _Intervals) -> float:
-    """How far p at the last time turns clockwise about zero over these intervals, less than half a circle in each."""
-    start, end = some.at_left[0, :, -1], some.at_right[0, :, -1]
-    cross, dot = start[0] * end[1] - start[1] * end[0], np.sum(start * end, axis=0)
-    return -float(np.sum(np.arctan2(cross, dot)))
+    """How far p at the last time turns clockwise about zero over these intervals, along their cubics."""
+    start, end = some.at_left[:, :, -1], some.at_right[:, :, -1]
+    width = (some.right - some.left) / 3
+    net = np.stack([start[0], start[0] + width * start[2], end[0] - width * end[2], end[0]])
+    weights, _ = _bernstein(np.linspace(0, 1, _CHORDS + 1))
+    along = np.einsum("ik,icn->kcn", weights, net)
+    (x0, y0), (x1, y1) = np.moveaxis(along[:-1], 1, 0), np.moveaxis(along[1:], 1, 0)
+    return -float(np.sum(np.arctan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)))
+
+
+# Chords of a cell's last edge, past which a zero could lie on the wrong side.
+_CHORDS = 32
 
 
 # --- motions ----------------------------------------------------------------------------------------------------------
