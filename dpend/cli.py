@@ -579,26 +579,21 @@ def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> 
     from rich.table import Table
 
     table = Table(title=_described(atlas.pendulum), title_justify="left", title_style="")
+    headings: tuple[str, ...] = ("family", "periods (s)", "from", "to", "orbits")
+    rows = [_family_row(atlas, one) for one in atlas.families]
+    what = f"{len(atlas.families)} families with {len(atlas)} orbits in the table"
     if theta1 is not None:
         headings = ("theta2 (deg)", "period (s)", "symmetry", "stability", "kappa", "dual (deg)", "error (deg)")
         rows = [_atlas_row(orbit) for orbit in atlas.orbits]
-    else:
-        headings = ("family", "periods (s)", "from", "to", "orbits")
-        rows = [_family_row(atlas, one) for one in atlas.families]
+        what = f"{len(atlas)} orbits with theta1 = {theta1:g} deg"
     for heading in headings:
         table.add_column(heading, justify="left" if heading in _WORDS else "right")
     for row in rows:
         table.add_row(*row)
     Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
     seen = atlas.coverage
-    if theta1 is not None:
-        print(
-            f"{len(atlas)} orbits with theta1 = {theta1:g} deg and a period of at most {atlas.max_period:g} s;", end=" "
-        )
-    else:
-        print(f"{len(atlas.families)} families with a period of at most {atlas.max_period:g} s,", end=" ")
-        print(f"{len(atlas)} orbits on them, {seen.slices} slices;", end=" ")
-    print(f"{seen.theta2_points} motions, {seen.time_points} times")
+    print(f"{what} and periods of at most {atlas.max_period:g} s", end="; ")
+    print(f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, {seen.time_points} times")
     agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
     print(f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding number {agree}")
     if out is not None:
@@ -608,9 +603,9 @@ def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> 
 _WORDS = ("symmetry", "stability", "family", "from", "to")
 
 
-def _atlas_row(orbit: PeriodicOrbit) -> tuple[str, ...]:
+def _atlas_row(orbit: PeriodicOrbit) -> list[str]:
     dual = f"{_degrees(orbit.dual.theta1):.4f}, {_degrees(orbit.dual.theta2):.4f}"
-    return (
+    return [
         f"{_degrees(orbit.theta2):.9f}",
         f"{float(orbit.period):.9f}",
         orbit.symmetry,
@@ -618,13 +613,13 @@ def _atlas_row(orbit: PeriodicOrbit) -> tuple[str, ...]:
         f"{float(orbit.kappa):.6g}",
         dual,
         f"{_degrees(orbit.error_estimate[0]):.0e}",
-    )
+    ]
 
 
-def _family_row(atlas: dpend.Atlas, record: dict[str, Any]) -> tuple[str, ...]:
+def _family_row(atlas: dpend.Atlas, record: dict[str, Any]) -> list[str]:
     count = int(np.sum(atlas.table["family"] == record["family"]))
     periods = f"{record['shortest_period_s']:.6f} - {record['longest_period_s']:.6f}"
-    return record["family"], periods, *record["ends"], str(count)
+    return [record["family"], periods, *record["ends"], str(count)]
 
 
 def _described(pendulum: Pendulum) -> str:
