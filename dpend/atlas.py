@@ -90,9 +90,9 @@ class Atlas:
     def where(
         self,
         *,
-        period: tuple[float, float] | None = None,
-        energy: tuple[float, float] | None = None,
-        kappa: tuple[float, float] | None = None,
+        period: Sequence[Any] | None = None,
+        energy: Sequence[Any] | None = None,
+        kappa: Sequence[Any] | None = None,
         symmetry: str | None = None,
         family: str | Sequence[str] | None = None,
     ) -> "Atlas":

@@ -48,6 +48,8 @@ _BATCH = 512
 _NARROWEST = 1e-11
 # The share of the measured error that is kept clear of: halving an interval takes a cubic's error down sixteen times.
 _CLEARANCE = 0.25
+# The error counts that far about a row, nearly a radian of the fast mode.
+_NEARBY = 16
 # A cell that is bent in time more than in theta2, as near a fold, is halved in time, so often at most.
 _SPLITS = 12
 # How far from the unit matrix a derivative may be.
@@ -192,9 +194,10 @@ class _Scanner:
         middle = 0.5 * (some.left + some.right)
         there = self.motions(middle)
         width = some.right - some.left
-        foretold = 0.5 * (some.at_left[0] + some.at_right[0]) + width / 8 * (some.at_left[2] - some.at_right[2])
-        error = _CLEARANCE * np.max(np.abs(foretold - there[0]), axis=0)
-        error = np.maximum(error[:-1], error[1:])
+        start, end = some.at_left, some.at_right
+        value = 0.5 * (start[0] + end[0]) + width / 8 * (start[2] - end[2]) - there[0]
+        slope = 1.5 * (end[0] - start[0]) / width - 0.25 * (start[2] + end[2]) - there[2]
+        error = _CLEARANCE * _nearby(np.max(np.maximum(np.abs(value), width / 8 * np.abs(slope)), axis=0))
         return (
             _Half(_Intervals(some.left, middle, some.at_left, there), error),
             _Half(_Intervals(middle, some.right, there, some.at_right), error),
@@ -221,7 +224,7 @@ class _Scanner:
             theta2 = some.left[lane[whole]] + told.where[0] * width
             time = self.dt * (row[whole] + cells.start[told.simple] + told.where[1] / 2**split)
             table = np.stack([theta2, time, told.sign, width, np.full_like(time, self.dt)], axis=1)
-            inside = np.all((told.where > -_EDGE) & (told.where < 1 + _EDGE), axis=0)
+            inside = np.all((told.where > -_EDGE) & (told.where < 1 + _EDGE), axis=0) & (time <= self.dt * self.rows)
             zeros += [Zero(*each) for each in table[inside].tolist()]
             late = cells.bent_in_time(told.open) & (split < _SPLITS)
             undecided[lane[cells.whole[told.open[~late]]]] = True
@@ -260,6 +263,16 @@ class _Scanner:
 class _Half(NamedTuple):
     intervals: _Intervals
     error: np.ndarray  # of the cells' values, shape (rows, n)
+
+
+def _nearby(error: np.ndarray) -> np.ndarray:
+    """The largest error at any row near each cell: one that is small in a few rows alone is so by accident."""
+    far = 1
+    while far < _NEARBY:
+        padded = np.pad(error, ((far, far), (0, 0)), mode="edge")
+        error = np.maximum(np.maximum(padded[: -2 * far], padded[2 * far :]), error)
+        far *= 2
+    return np.asarray(np.maximum(error[:-1], error[1:]))
 
 
 def _net(some: _Intervals, row: np.ndarray, lane: np.ndarray, dt: float) -> np.ndarray:

@@ -75,9 +75,20 @@ def test_several_launches_come_back_in_order(paper, monkeypatch):
     assert len(traces) == before <= 3
 
 
-def test_results_must_be_scalars(paper):
-    with pytest.raises(ValueError, match=r"must be a scalar, got shape \(2,\) for \['both'\]"):
-        lanes.over_lanes(lambda p, x: {"both": jax.numpy.stack([x.theta1, x.p1])}, paper, releases())
+def test_results_of_any_shape_come_lanes_last(paper):
+    """A table for each lane, beside a scalar; launches are then smaller, so that there are several."""
+    states = releases()
+
+    def times_table(pendulum, x):
+        return {
+            "table": jax.numpy.outer(jax.numpy.arange(40.0), jax.numpy.stack([x.theta1, x.theta2])),
+            "one": x.theta1,
+        }
+
+    out = lanes.over_lanes(times_table, paper, states)
+    both = np.stack([states.theta1, states.theta2])
+    np.testing.assert_array_equal(out["table"], np.arange(40.0)[:, None, None] * both)
+    np.testing.assert_array_equal(out["one"], states.theta1)
 
 
 @pytest.mark.parametrize("devices", [1, pytest.param(3, marks=pytest.mark.slow)])

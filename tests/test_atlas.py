@@ -1,0 +1,155 @@
+"""The atlas of one release angle: known orbits, other integrators, invariances, and its file."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from test_scan import FORTY
+
+import dpend
+from dpend import Pendulum, Status
+
+
+@pytest.fixture(scope="module")
+def forty(paper):
+    return dpend.find_brake_orbits(paper, theta1=np.radians(40.0), max_period=2.0)
+
+
+def test_the_eight_orbits_of_forty_degrees(forty):
+    """All of them, no others, none of the two second returns, and nothing in doubt."""
+    known = sorted((period, theta2) for theta2, period in FORTY if period not in (1.579211862, 1.508837732))
+    np.testing.assert_allclose(forty.table["period"], [period for period, _ in known], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(forty.table["theta2"]), [theta2 for _, theta2 in known], atol=2e-9)
+    assert (
+        forty.table["symmetry"].tolist() == ["centred"] * 2 + ["brake", "centred", "brake", "centred"] + ["brake"] * 2
+    )
+    assert np.all(forty.table["status"] == Status.CONVERGED)
+    seen = forty.coverage
+    assert (seen.suspicious_cells, seen.slices, seen.refinements, seen.degree) == (0, 1, 2, seen.winding)
+
+
+def test_every_row_is_an_orbit(forty, paper):
+    """At rest at its dual after half the period and back after the whole, by diffrax; kappa by the whole monodromy; all
+    as well as kappa allows."""
+    for orbit in forty.orbits:
+        growth = max(1.0, abs(2 * orbit.kappa))
+        half, whole = (orbit.period / 2, orbit.period)
+        end = dpend.reference(paper, orbit.state, [half, whole], error=False).state
+        states = np.stack(jax.tree.leaves(end))
+        np.testing.assert_allclose(states[:2, 0], [orbit.dual.theta1, orbit.dual.theta2], atol=1e-11 * growth)
+        np.testing.assert_allclose(states[:2, 1], [orbit.theta1, orbit.theta2], atol=1e-11 * growth)
+        np.testing.assert_allclose(states[2:], 0, atol=1e-12 * growth)
+        assert orbit.residual < 1e-12 * growth
+        assert max(orbit.error_estimate) < 1e-9
+        matrix = dpend.monodromy(paper, orbit.state, float(whole), dpend.Scheme("rk8", 1e-3))
+        np.testing.assert_allclose((np.trace(matrix) - 2) / 2, orbit.kappa, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(dpend.hamiltonian(paper, orbit.state), orbit.energy, rtol=1e-14)
+
+
+def test_a_longer_list_holds_the_shorter(forty, paper):
+    shorter = dpend.find_brake_orbits(paper, theta1=np.radians(40.0), max_period=1.3)
+    assert len(shorter) == 5
+    np.testing.assert_allclose(shorter.table["theta2"], forty.table["theta2"][:5], atol=1e-13)
+    last = dpend.find_brake_orbits(paper, theta1=np.radians(40.0), max_period=float(forty.table["period"][4]))
+    assert len(last) == 5  # the longest period itself is in
+
+
+def test_mirror_turns_and_units(forty):
+    """theta -> -theta; full turns; lengths and gravity scale the period alone."""
+    other = Pendulum(0.05, 0.05, 3.0, 3.0, 1.6)
+    scale = np.sqrt(0.05 / 1.6 / (0.2 / 9.8))
+    mirrored = dpend.find_brake_orbits(other, theta1=np.radians(-40.0 - 360.0), max_period=2.0 * scale)
+    np.testing.assert_allclose(mirrored.table["theta2"], -forty.table["theta2"], atol=1e-12)
+    np.testing.assert_allclose(mirrored.table["period"], scale * forty.table["period"], rtol=1e-13)
+
+
+def test_mirror_images_are_listed_once_where_the_upper_rod_hangs(paper):
+    """Released with the upper rod straight down or up, theta2 and -theta2 are one orbit; and the equilibria none."""
+    down = dpend.find_brake_orbits(paper, theta1=0.0, max_period=2.0)
+    up = dpend.find_brake_orbits(paper, theta1=np.pi, max_period=2.0)
+    assert (len(down), len(up)) == (1, 6)
+    for found in (down, up):
+        assert np.all(found.table["theta2"] > 0)
+        assert found.coverage.suspicious_cells == 0
+
+
+def test_near_the_bottom_there_are_the_normal_modes(paper):
+    """At 1e-3 rad: theta2/theta1 and the period of both modes."""
+    found = dpend.find_brake_orbits(paper, theta1=1e-3, max_period=1.2).where(symmetry="centred")
+    small = np.abs(found.table["theta2"]) < 0.1
+    modes = dpend.normal_modes(paper)[::-1]
+    np.testing.assert_allclose(found.table["theta2"][small] / 1e-3, [mode.ratio for mode in modes], rtol=1e-5)
+    np.testing.assert_allclose(found.table["period"][small], [mode.period for mode in modes], rtol=1e-5)
+
+
+@pytest.mark.parametrize("ending", ["json", "csv"])
+def test_files_hold_every_bit(forty, tmp_path, ending):
+    path = tmp_path / f"forty.{ending}"
+    forty.save(path)
+    again = dpend.load_atlas(path)
+    assert again.coverage == forty.coverage
+    assert jax.tree.leaves(again.pendulum) == jax.tree.leaves(forty.pendulum)
+    for key, column in forty.table.items():
+        if column.dtype.kind == "f":  # degrees and back: a bit may be lost
+            np.testing.assert_allclose(again.table[key], column, rtol=3e-16)
+        else:
+            np.testing.assert_array_equal(again.table[key], column)
+    assert [o.symmetry for o in again.orbits] == [o.symmetry for o in forty.orbits]
+
+
+def test_the_record_names_its_units(forty):
+    record = json.loads(json.dumps(forty.record()["orbits"][0]))
+    np.testing.assert_allclose(record["theta1_deg"], 40.0, rtol=1e-15)
+    assert {"theta2_deg", "period_s", "energy_J", "kappa", "symmetry", "dual", "residual"} <= set(record)
+    np.testing.assert_allclose(record["dual"]["theta1_deg"], -40.0, rtol=1e-14)
+
+
+def test_filters(forty):
+    assert len(forty.where(symmetry="brake", period=(1.0, 1.5))) == 2
+    assert np.all(np.abs(forty.where(kappa=(-1, 1)).table["kappa"]) <= 1)
+    assert len(forty.where(energy=(-1.0, np.median(forty.table["energy"])))) == 4
+    nothing = forty.where(period=(3, 4))
+    assert (len(nothing), nothing.orbits) == (0, ())
+    for wrong, text in (
+        ({"period": (1, 2, 3)}, "period must be a pair"),
+        ({"kappa": (1, -1)}, "kappa must be a pair"),
+        ({"symmetry": "odd"}, "symmetry must be one of brake, centred"),
+        ({"family": ["C1"]}, "family must be one of"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            forty.where(**wrong)
+
+
+def test_an_atlas_without_orbits(paper, tmp_path):
+    nothing = dpend.find_brake_orbits(paper, theta1=1.0, max_period=0.1)
+    assert len(nothing) == 0
+    for ending in ("json", "csv"):
+        nothing.save(tmp_path / f"nothing.{ending}")
+        assert len(dpend.load_atlas(tmp_path / f"nothing.{ending}")) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"theta1": np.nan}, "theta1 must be a finite number"),
+        ({"max_period": 0.0}, "max_period must be"),
+        ({"max_period": np.inf}, "max_period must be"),
+        ({"pendulum": Pendulum(g=0.0)}, "g must be positive"),
+    ],
+)
+def test_bad_requests_are_refused(paper, change, text):
+    request = {"pendulum": paper, "theta1": 1.0, "max_period": 1.0} | change
+    with pytest.raises(ValueError, match=text):
+        dpend.find_brake_orbits(request.pop("pendulum"), **request)
+
+
+def test_files_that_are_no_atlas(forty, tmp_path):
+    with pytest.raises(ValueError, match="path must end in .csv or .json"):
+        forty.save(tmp_path / "a.txt")
+    with pytest.raises(ValueError, match="path must be a file that can be read"):
+        dpend.load_atlas(tmp_path / "none.json")
+    for name, text in (("a.json", "{}"), ("b.json", "[1]"), ("c.csv", "theta1,theta2\n1,2\n"), ("d.json", "\x00")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError, match="path must be a file that Atlas.save wrote"):
+            dpend.load_atlas(tmp_path / name)
