@@ -34,6 +34,9 @@ _INTERVALS, _MORE_INTERVALS = 128, 1024
 # Points along families lie no further apart than this [arclength], so that chords between them are true to the second
 # [rad, and log of the period]: what is nearer to a chord belongs to its family.
 _STEP, _NEAR = 0.02, 3e-3
+# In a slice, where a curve that runs along it makes more of the same error, partners are this close; where it turns
+# back, two passages of one family.
+_PARTNER, _PAIR = 0.03, 0.1
 
 
 def find_brake_families(
@@ -120,11 +123,13 @@ class _Track:
         flip = np.array([-1.0, -1.0, 1.0])
         curves = [own, own * flip] + ([other, other * flip] if family.symmetry == "brake" else [])
         chords = [np.stack([curve[:-1], curve[1:]], axis=1) for curve in curves]
-        # Beyond a branch point a curve goes on with its own orbits at their other rests, in the mirror or not.
+        # Beyond a branch point a curve goes on with its own orbits at their other rests, in the mirror or not; beyond
+        # an equilibrium with its own mirror image.
         for end, place in zip(family.ends, (0, -1), strict=True):
-            if end == "branch point":
-                chords.append(_bridges(own[place], np.stack([other[place], -other[place]])))
-                chords.append(chords[-1] * flip)
+            if end in ("branch point", "normal mode"):
+                images = [other[place], -other[place]] if end == "branch point" else [-own[place]]
+                bridge = _bridge(own[place], np.stack(images))
+                chords += [bridge, bridge * flip]
         return _Track(family, seed, level, np.concatenate(chords))
 
     def away(self, release: np.ndarray) -> float:
@@ -137,7 +142,7 @@ class _Track:
         return float(np.min(np.linalg.norm(to - share[:, None] * way, axis=1)))
 
     def passages(self, theta1: float) -> np.ndarray:
-        """(theta2, period) where it passes a slice, shape (n, 2); one through a chord's end may count twice."""
+        """(theta2, period) where it passes a slice, shape (n, 2)."""
         start, end = self.chords[:, 0], self.chords[:, 1]
         turns = np.round((start[:, 0] - theta1) / (2 * np.pi))
         before, after = start[:, 0] - theta1 - 2 * np.pi * turns, end[:, 0] - theta1 - 2 * np.pi * turns
@@ -147,8 +152,8 @@ class _Track:
         return np.column_stack([point[:, 1], np.exp(point[:, 2])])
 
 
-def _bridges(point: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """The chord from a curve's end to the nearer of two images of it, shape (1, 2, 3)."""
+def _bridge(point: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """The chord from a curve's end to the nearest of some images of it, shape (1, 2, 3)."""
     way = images[:, :2] - point[:2]
     way -= 2 * np.pi * np.round(way / (2 * np.pi))
     nearer = way[np.argmin(np.linalg.norm(way, axis=1))]
@@ -219,20 +224,29 @@ class _Survey:
         family = follow_family(self.pendulum, orbit, longest_step=_STEP, longest_period=longest)
         return _Track.of(family, seed, level)
 
-    def unanswered(self) -> list[tuple[float, float, float]]:
-        """Passages of families through slices where no return to rest was found: (theta1, theta2, period)."""
-        missing = []
-        for theta1, found in self.slices.items():
-            seen = np.array(found.returns).reshape(-1, 2)
-            for track in self.tracks:
-                for theta2, period in track.passages(theta1):
-                    if period > self.max_period * (1 - _NEAR):
-                        continue
-                    apart = theta2 - seen[:, 0]
-                    apart -= 2 * np.pi * np.round(apart / (2 * np.pi))
-                    if not np.any(np.hypot(apart, np.log(period / seen[:, 1])) < 3 * _NEAR):
-                        missing.append((theta1, float(theta2), float(period)))
-        return missing
+    def unmatched(self) -> list[tuple[float, float, float]]:
+        """What is left when each slice's returns are given to the families' passages, one to one: the returns and the
+        passages (theta1, theta2, period) that have no partner. Where a family turns back in a slice, its chords may
+        have two passages more or less than the curve: pairs close together are let go.
+        """
+        return [
+            (theta1, *one)
+            for theta1, found in self.slices.items()
+            for left in _left_over(np.array(found.returns).reshape(-1, 2), self._passages(theta1))
+            for one in _without_pairs(left[left[:, 1] < self.max_period * (1 - _NEAR)]).tolist()
+        ]
+
+    def _passages(self, theta1: float) -> np.ndarray:
+        """(theta2, period) where families pass a slice, run through as often as the longest period allows."""
+        points = [np.zeros((0, 2))]
+        for track in self.tracks:
+            passages = track.passages(theta1)
+            if not len(passages):
+                continue
+            most = int(self.max_period * (1 + _NEAR) / np.min(passages[:, 1]))
+            points += [passages * [1, cover] for cover in range(1, most + 1)]
+        every = np.concatenate(points)
+        return every[every[:, 1] < self.max_period * (1 + _NEAR)]
 
     def atlas(self, level: int) -> Atlas:
         entries = [_entry(track.family, self.max_period) for track in self.tracks]
@@ -249,12 +263,38 @@ class _Survey:
             theta2_points=sum(one.motions for one in every),
             time_points=max(one.rows for one in every),
             refinements=level,
-            suspicious_cells=sum(one.open_cells + one.lost for one in every) + len(self.unanswered()),
+            suspicious_cells=sum(one.open_cells + one.lost for one in every) + len(self.unmatched()),
             winding=sum(one.winding for one in every),
             degree=sum(one.degree for one in every),
             slices=len(self.slices),
         )
         return Atlas(self.pendulum, self.max_period, stacked(tables), tuple(records), coverage)
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Distances between all pairs (theta2, period) [rad, and log of the period]."""
+    angles = one[:, None, 0] - other[None, :, 0]
+    angles -= 2 * np.pi * np.round(angles / (2 * np.pi))
+    return np.asarray(np.hypot(angles, np.log(one[:, None, 1] / other[None, :, 1])))
+
+
+def _left_over(returns: np.ndarray, passages: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of each kind that have no partner, the nearest having been matched first."""
+    apart = _apart(returns, passages)
+    free = np.ones(len(returns), bool), np.ones(len(passages), bool)
+    for index in np.argsort(apart, axis=None):
+        i, j = np.unravel_index(index, apart.shape)
+        if apart[i, j] > _PARTNER:
+            break
+        if free[0][i] and free[1][j]:
+            free[0][i] = free[1][j] = False
+    return returns[free[0]], passages[free[1]]
+
+
+def _without_pairs(points: np.ndarray) -> np.ndarray:
+    """Those that have no other close by."""
+    apart = _apart(points, points) + np.diag(np.full(len(points), np.inf))
+    return points[np.min(apart, axis=1, initial=np.inf) > _PAIR]
 
 
 def _entry(family: Family, max_period: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

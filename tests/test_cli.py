@@ -304,3 +304,40 @@ def test_a_family_as_json_and_csv(capsys, tmp_path):
     ):
         status, text, err = run(capsys, "family", *bad)
         assert (status, text, err.count("\n")) == (2, "", 1)
+
+
+def test_the_atlas_of_an_angle(capsys, tmp_path):
+    status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
+    assert status == 0
+    periods = [orbit["period_s"] for orbit in found["orbits"]]
+    np.testing.assert_allclose(periods, [0.754418866, 0.789605931, 1.174420237, 1.212756333, 1.283263044], atol=1e-9)
+    keys = set("theta1_deg theta2_deg period_s energy_J kappa symmetry dual residual".split())
+    assert keys <= found["orbits"][0].keys()
+    assert set("theta2_points time_points refinements suspicious_cells".split()) <= found["coverage"].keys()
+    out = tmp_path / "forty.csv"
+    status, text, err = run(capsys, "atlas", "--theta1", 40, "--max-period", 1.3, "--out", out)
+    assert (status, err) == (0, "")
+    assert "5 orbits with theta1 = 40 deg" in text
+    assert "the winding number agree" in text
+    np.testing.assert_allclose(dpend.load_atlas(out).table["period"], periods, rtol=1e-14)
+    for bad in (
+        ("--theta1", "nan", "--max-period", 1),
+        ("--theta1", 40, "--max-period", 0),
+        ("--theta1", 40),
+        ("--theta1", 40, "--max-period", 1, "--out", "f.txt"),
+        ("--theta1", 40, "--max-period", 1, "--store", "s.json"),
+        ("--max-period", 1, "--store", "s.zarr"),
+        ("--max-period", 1, "--g", 0),
+    ):
+        status, text, err = run(capsys, "atlas", *bad)
+        assert (status, text, err.count("\n")) == (2, "", 1)
+
+
+@pytest.mark.slow
+def test_the_atlas_of_the_square(capsys, tmp_path):
+    store = tmp_path / "s.json"
+    status, found = run_json(capsys, "atlas", "--max-period", 1.0, "--store", store)
+    assert (status, [one["family"] for one in found["families"]]) == (0, ["C1", "C2", "C3"])
+    status, text, _ = run(capsys, "atlas", "--max-period", 1.0, "--store", store)
+    assert status == 0
+    assert "3 families" in text
