@@ -20,11 +20,11 @@ import numpy as np
 from dpend._runtime import require_float64
 from dpend.families import known_pendulum
 from dpend.files import as_json, check_place, replacing
-from dpend.orbits import PeriodicOrbit, find_orbit
-from dpend.pendulum import Pendulum, number, released
+from dpend.orbits import SYMMETRIES, PeriodicOrbit, find_orbit
+from dpend.pendulum import Pendulum, released
 from dpend.scan import Scan, Zero, scanned
 from dpend.shooting import natural
-from dpend.trajectory import Status
+from dpend.trajectory import Status, known_number
 
 # Intervals of theta2 that a scan begins with, and how often they are doubled at most.
 _INTERVALS, _MOST_REFINEMENTS = 128, 6
@@ -93,29 +93,28 @@ class Atlas:
         period: Sequence[Any] | None = None,
         energy: Sequence[Any] | None = None,
         kappa: Sequence[Any] | None = None,
-        symmetry: str | None = None,
-        family: str | Sequence[str] | None = None,
+        symmetry: Any = None,
+        family: Any = None,
     ) -> "Atlas":
         """The rows with period [s], energy [J] and kappa in closed ranges, of a symmetry, of one family or of several.
 
         Raises:
-            ValueError: a range that is none; a symmetry or family that no row has.
+            ValueError: a range that is none; an unknown symmetry, or a family that the atlas does not have.
         """
         keep = np.ones(len(self), bool)
         for name, bounds in (("period", period), ("energy", energy), ("kappa", kappa)):
             if bounds is not None:
                 low, high = _range(name, bounds)
                 keep &= (self.table[name] >= low) & (self.table[name] <= high)
-        for name, wanted in (("symmetry", symmetry), ("family", family)):
+        names = {one["family"] for one in self.families}
+        for name, wanted, known in (("symmetry", symmetry, set(SYMMETRIES)), ("family", family, names)):
             if wanted is not None:
-                names, known = [wanted] if isinstance(wanted, str) else list(wanted), set(self.table[name].tolist())
-                for one in names:
+                chosen = list(wanted) if isinstance(wanted, (list, tuple, set)) else [wanted]
+                for one in chosen:
                     if one not in known:
-                        raise ValueError(f"{name} must be one of {', '.join(sorted(known))}, got {one!r}")
-                keep &= np.isin(self.table[name], names)
-        table = {key: column[keep] for key, column in self.table.items()}
-        left = set(table["family"].tolist())
-        return replace(self, table=table, families=tuple(one for one in self.families if one["family"] in left))
+                        raise ValueError(f"{name} must be one of {', '.join(sorted(known)) or 'none'}, got {one!r}")
+                keep &= np.isin(self.table[name], chosen)
+        return replace(self, table={key: column[keep] for key, column in self.table.items()})
 
     def record(self) -> dict[str, Any]:
         """All of it as plain numbers and text, angles in degrees: what `save` writes and `--json` prints."""
@@ -130,8 +129,8 @@ class Atlas:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes F.json, or F.csv whose first line is a comment with all but the table, to be read by `load_atlas`.
 
-        Angles in degrees, everything to the last bit. How many digits of theta2 and the period are to be trusted, the
-        columns with their errors say.
+        Angles in degrees, which may cost their last bit, everything else as it is. How many digits of theta2 and the
+        period are to be trusted, the columns with their errors say.
 
         Raises:
             ValueError: another ending; no directory to write in.
@@ -172,6 +171,8 @@ def load_atlas(path: str | os.PathLike[str]) -> Atlas:
         ValueError: no such file, or one that holds no atlas.
     """
     path = Path(path)
+    if path.suffix not in (".csv", ".json"):
+        raise ValueError(f"path must end in .csv or .json, got {path}: Atlas.save writes no others")
     try:
         text = path.read_text()
         if path.suffix == ".csv":
@@ -304,7 +305,7 @@ def _range(name: str, bounds: Any) -> tuple[float, float]:
 # --- one release angle ------------------------------------------------------------------------------------------------
 
 
-def find_brake_orbits(pendulum: Pendulum, *, theta1: float, max_period: float) -> Atlas:
+def find_brake_orbits(pendulum: Pendulum, *, theta1: Any, max_period: Any) -> Atlas:
     """Every orbit released from rest at `theta1` with a period of at most `max_period`: all its partners theta2.
 
     The returns to rest are all zeros of (p1, p2) in (theta2, t), found cell by cell (see `scan`). The scan is repeated
@@ -325,13 +326,13 @@ def find_brake_orbits(pendulum: Pendulum, *, theta1: float, max_period: float) -
     """
     require_float64()
     fixed = known_pendulum(pendulum)
-    theta1 = float(number("theta1", theta1, unit="rad"))
-    max_period = float(number("max_period", max_period, positive=True, unit="s"))
+    theta1 = known_number("theta1", theta1, unit="rad")
+    max_period = known_number("max_period", max_period, positive=True, unit="s")
     counts: list[int] = []
     for refinement in range(_MOST_REFINEMENTS + 1):
         result = returns(fixed, theta1, max_period, _INTERVALS << refinement)
         counts.append(len(result.zeros))
-        if len(counts) > 2 and counts[-3:] == counts[-1:] * 3:
+        if (len(counts) > 2 and counts[-3:] == counts[-1:] * 3) or result.exhausted:
             break
     found, lost = _solved(fixed, theta1, max_period, result)
     coverage = Coverage(

@@ -4,6 +4,7 @@ Between the compiled walk (`shooting`) and what users see (`families`). All in n
 here between two calls of compiled code is done once in 32 points.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -103,7 +104,7 @@ class Problem:
         nothing = np.zeros((CHUNK, UNKNOWNS))
         tasks = Tasks(nothing, nothing, nothing[:, 0].astype(int), np.int64(0))
         tables: list[np.ndarray] = []
-        count, end = 0, ""
+        count, end, begin = 0, "", start
         while not end and count < reach.points:
             start, table, more, status = walk(self.natural, start, np.float64(reach.step), tasks, self.arc)
             tables.append(np.asarray(table)[: int(more)])
@@ -114,14 +115,36 @@ class Problem:
             back = None if origin is None else self._back(origin, rows, count - int(more))
             if back is not None:
                 return _cut(rows, back)
-            (longer,) = np.nonzero(PARTS[self.symmetry] * rows.times.sum(axis=1) > reach.period)
+            (longer,) = np.nonzero(self.period(rows) > reach.period)
             if longer.size:
-                return some_of(rows, slice(longer[0] + 1)), "longest period"
+                rows = some_of(rows, slice(longer[0] + 1))
+                return self._ending_at(reach.period, begin, rows), "longest period"
         if count > reach.points:
             return some_of(rows, slice(reach.points)), "unfinished"
         if end == "ended":
             end = "homoclinic" if self._slows(rows) else "normal mode"
         return rows, end or "unfinished"
+
+    def period(self, rows: Corrected) -> np.ndarray:
+        return np.asarray(PARTS[self.symmetry] * rows.times.sum(axis=1))
+
+    def _ending_at(self, period: float, begin: Walk, rows: Corrected) -> Corrected:
+        """The rows, the last of which takes longer than `period`, with one of that period in its place; without, if
+        the family was that long from its beginning.
+        """
+        last = curve_of(some_of(rows, slice(-2, None)))
+        if len(rows.point) == 1:
+            points, tangents = np.vstack([begin.point, last.points]), np.vstack([begin.tangent, last.tangents])
+            last = Curve(points, tangents, np.append(last.steps, last.steps))
+        place, share = np.zeros(1, int), np.ones(1)
+        end = some_of(rows, slice(-1, None))
+        for _ in range(_APPROACH):
+            rate = end.time_slope / end.times.sum(axis=1) * last.lengths
+            share = np.clip(share - np.log(self.period(end) / period) / rate, 0.0, 1.0)
+            tangent = last.tangents_between(place, share)
+            end = self.corrected(last.between(place, share), METRIC * tangent, last.steps[1:])
+        found = end.converged[0] and abs(math.log(self.period(end)[0] / period)) < _SAME_PLACE
+        return joined(some_of(rows, slice(-1)), end) if found else some_of(rows, slice(-1))
 
     def on_curve(self, point: np.ndarray) -> Corrected | None:
         """The point of the family near one that is nearly on it, its tangent not known; None if there is none."""
@@ -206,6 +229,8 @@ class Problem:
         return bool(np.linalg.norm(apart) < _SAME_PLACE)
 
 
+# Newton's iterations for the orbit of a period, from the end of a step.
+_APPROACH = 6
 # Points at the beginning that are not looked at for a return; and what counts as one [rad, and log of the time].
 _LEAVING, _SAME_PLACE = 4, 1e-7
 
@@ -223,6 +248,47 @@ def _cut(rows: Corrected, count: int) -> tuple[Corrected, str]:
     return (some_of(rows, slice(half[0] + 1)), "branch point") if half else (rows, "closed")
 
 
+def without_its_image(rows: Corrected, ends: tuple[str, str], here: int) -> tuple[Corrected, tuple[str, str]]:
+    """The part of a curve of brake orbits with the point `here` that does not hold them a second time, and its ends.
+
+    Through a branch point, where its orbits become more symmetric ones, a curve goes on with the same orbits, met at
+    their other rests.
+    """
+    (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
+    for i in crossings.tolist():
+        if not _reflects(rows, i):
+            continue
+        if here <= i:
+            return without_its_image(some_of(rows, slice(i + 1)), (ends[0], "branch point"), here)
+        return without_its_image(some_of(rows, slice(i + 1, None)), ("branch point", ends[1]), here - i - 1)
+    return rows, ends
+
+
+def _reflects(rows: Corrected, crossing: int) -> bool:
+    """Whether the points on both sides of a crossing are each other's images: their orbits' other rests, in the mirror
+    or not.
+    """
+    shorter, longer = sorted(
+        (some_of(rows, slice(crossing + 1)), some_of(rows, slice(crossing + 1, None))), key=lambda part: len(part.point)
+    )
+    if len(shorter.point) < _LEAVING:
+        return False
+    at = len(shorter.point) // 2  # far from the branch point, where all is close to all
+    curve = _reduced(longer)
+    chords = np.diff(curve, axis=0)
+    for sign in (1.0, -1.0):
+        image = np.append(sign * shorter.end[at, :2], _reduced(shorter)[at, 2])
+        to = np.array([way_to(point, image) for point in curve[:-1]])
+        share = np.clip(np.sum(to * chords, axis=1) / np.sum(chords * chords, axis=1), 0.0, 1.0)
+        away = np.linalg.norm(to - share[:, None] * chords, axis=1)
+        nearest = int(np.argmin(away))
+        if away[nearest] < _IMAGE * np.linalg.norm(chords[nearest]):
+            return True
+    return False
+
+
+# How near to a chord an image is, as a share of its length.
+_IMAGE = 0.05
 # How far from the middle of its way a curve may have turned round, as a share of it.
 _MIDDLE = 0.1
 

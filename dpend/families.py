@@ -30,6 +30,7 @@ from dpend.continuation import (
     some_of,
     turned,
     way_to,
+    without_its_image,
 )
 from dpend.orbits import BRANCHES, PeriodicOrbit, mirrored
 from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
@@ -43,7 +44,7 @@ from dpend.shooting import (
     sensitivities,
 )
 from dpend.stability import stability_of
-from dpend.trajectory import Status, known_value
+from dpend.trajectory import Status, known_number, known_value
 
 # The longest step: a hundred points or so for a family, close enough for cubics to show every turn.
 _LONGEST_STEP = 0.1
@@ -593,12 +594,12 @@ def follow_family(
             centred orbits with c = 1 the orbits with x(T/2) = -x(0) that are no longer released from rest, with c = -1
             those released from rest that are no longer centred, at a resonance the brake orbits of k times the period.
         longest_step: in arclength; the default gives about a hundred points.
-        longest_period: [s]; the family is followed no further than to its first orbit that takes longer.
+        longest_period: [s]; the family is followed to its first orbit of this period.
         most_points: on one side of the start.
     Raises:
         ValueError: an unknown name; g not positive; an orbit of another pendulum, or that has not converged; a special
             point where nothing branches off, or only orbits (c = -1 in half of the cases) that are centred no longer
-            and never rest.
+            and never rest; longest_period below the period of the first orbit.
         RuntimeError: float64 is switched off in JAX.
     See also: Doedel, Keller and Kernevez, Numerical analysis and control of bifurcation problems (1991); Peeters et
         al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
@@ -636,14 +637,9 @@ def known_pendulum(pendulum: Pendulum) -> Pendulum:
     """
     if not isinstance(pendulum, Pendulum):
         raise ValueError(f"pendulum must be a Pendulum, got {type(pendulum).__name__}")
-    values = {}
-    for name, leaf in vars(pendulum).items():
-        value = known_value(leaf)
-        if value is None:
-            raise ValueError(f"{name} must be a number here, not traced by jit: use find_orbit inside jit")
-        values[name] = value
+    values = {name: known_number(name, leaf) for name, leaf in vars(pendulum).items()}
     if not values["g"] > 0:
-        raise ValueError(f"g must be positive for a family, got {values['g']:g}: nothing swings back without gravity")
+        raise ValueError(f"g must be positive for orbits, got {values['g']:g}: nothing swings back without gravity")
     return Pendulum(**values)
 
 
@@ -654,14 +650,18 @@ def _from_mode(problem: Problem, branch: str, reach: Reach) -> Family:
     start = jax.tree.map(np.asarray, _beginning(problem.natural, branch == "in-phase"))
     rows, end = problem.followed(start, None, reach)
     if not len(rows.point):
-        raise ValueError(
-            f"longest_period must be longer than a family's first orbits, got {reach.period:g} units of "
-            "sqrt(l1/g): give a longer one"
-        )
+        raise _too_short(reach)
     curve = curve_of(rows)
     points, tangents = np.vstack([start.point, curve.points]), np.vstack([start.tangent, curve.tangents])
     curve = Curve(points, tangents, np.append(start.steps, curve.steps))
     return _family(problem, rows, curve, ("normal mode", end))
+
+
+def _too_short(reach: Reach) -> ValueError:
+    return ValueError(
+        f"longest_period must be longer than the period of the first orbit, got {reach.period:g} sqrt(l1/g): give a "
+        "longer one"
+    )
 
 
 def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reach: Reach) -> Family:
@@ -688,6 +688,8 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reac
     symmetry = orbit.symmetry
     full = turns.get(symmetry, np.zeros(2))
     problem = Problem(pendulum, scaled, symmetry, (float(full[0]), float(full[1])))
+    if orbit.period / second > reach.period * (1 + 1e-12):
+        raise _too_short(reach)
     duration = float(orbit.period) / second / PARTS[symmetry]
     point = laid_out(problem, np.zeros(1), state[None], duration)
     rows = problem.on_curve(point)
@@ -708,8 +710,10 @@ def _both_ways(problem: Problem, rows: Corrected, reach: Reach) -> Family:
     if end == "closed":
         return _closed(problem, rows, ahead)
     behind, begin = problem.followed(start._replace(tangent=-start.tangent), rows, reach)
-    rows = joined(turned(behind), rows, ahead)
-    return _family(problem, rows, curve_of(rows), (begin, end))
+    whole, ends, here = joined(turned(behind), rows, ahead), (begin, end), len(behind.point)
+    if problem.symmetry == "brake":
+        whole, ends = without_its_image(whole, ends, here)
+    return _family(problem, whole, curve_of(whole), ends)
 
 
 def _closed(problem: Problem, start: Corrected, ahead: Corrected) -> Family:
@@ -767,6 +771,8 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) 
             raise ValueError(
                 f"start must be a point where a family that can be followed branches off, got {special.kind} {why}"
             )
+        if problem.period(rows)[0] > reach.period:
+            raise _too_short(reach)
         start = begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, reach.step), rows.steps[0])
         ahead, end = problem.followed(start, rows, reach)
         if end == "closed":

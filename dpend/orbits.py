@@ -545,7 +545,8 @@ _LEFT = 0.1
 
 # A guess may be any multiple of the minimal period up to this one.
 _LARGEST_COVER = 16
-# How far from rest [units m2 l2 sqrt(g l2)], or from the centre [rad], a shorter orbit may be: the root has 1e-12.
+# How far from rest [units m2 l2 sqrt(g l2)], or from the centre [rad], a shorter orbit may be, the root having 1e-12;
+# and how near to an equilibrium a search may end; both in units of the swing.
 _SAME = 1e-6
 
 
@@ -564,11 +565,16 @@ def _near_guess(pendulum, line, x, log_time, symmetry, error, turn, tolerance, m
     log_time = first.log_time - jnp.log(cover)
     settings = _Settings(turn, tolerance, jnp.maximum(max_iterations - first.iterations, 1), error)
     newton, steps, change = _solved(fixed, still, first.x, log_time, first.shot.rate, turns, symmetry, settings)
-    at_equilibrium = jnp.max(jnp.abs(jnp.sin(angles))) < _SAME
+    at_equilibrium = _swing(angles) < _SAME * jnp.minimum(1.0, _swing(still.base + x * still.direction))
     status = jnp.where(first.status == Status.CONVERGED, newton.status, first.status)
     status = jnp.where(at_equilibrium, Status.TRIVIAL_ROOT, status)
     newton = newton._replace(iterations=first.iterations + newton.iterations)
     return _orbit(pendulum, line, newton, steps, change, turns, symmetry, status)
+
+
+def _swing(angles: Array) -> Scalar:
+    """How far a release is from the nearest equilibrium [rad, up to 1]: the scale of all that is small."""
+    return jnp.max(jnp.abs(jnp.sin(angles)))
 
 
 def _rate_along(pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, steps: Scalar) -> tuple[Scalar, Array]:
@@ -600,7 +606,7 @@ def _cover(
         missed = jnp.abs(jnp.stack([ends.theta1, ends.theta2]) - jnp.pi * reached)
     else:
         missed = jnp.abs(jnp.stack([ends.p1, ends.p2])) / _momentum_unit(pendulum)
-    same = jnp.max(missed, axis=0) < _SAME
+    same = jnp.max(missed, axis=0) < _SAME * jnp.minimum(1.0, _swing(angles))
     last = k.size - 1 - jnp.argmax(same[::-1])
     covered = jnp.any(same)
     turns = jnp.where(covered, reached[:, last], turns) if symmetry == "centred" else turns

@@ -44,6 +44,8 @@ _ROW = 0.05
 _COARSE, _DENSER = 0.02, 6
 # Intervals of theta2 looked at together: as many as fit a cache.
 _BATCH = 512
+# So many motions are integrated at most: what is undecided then stays so.
+_MOST_MOTIONS = 200_000
 # Intervals [rad] narrower than this are not halved: rounding, magnified as the tangent is, would be all there is.
 _NARROWEST = 1e-11
 # The share of the measured error that is kept clear of: halving an interval takes a cubic's error down sixteen times.
@@ -79,7 +81,8 @@ class Scan:
         zeros: in order of theta2.
         motions: how many were integrated.
         rows: how many times each was looked at.
-        open_cells: (theta2, width) of intervals that were left undecided.
+        open_cells: (theta2, width) of intervals that were left undecided: too narrow to halve, beyond the number of
+            motions that are worth it, or not finite.
         winding: of p at the last time as theta2 goes round, clockwise: the way round the rectangle that keeps it left.
     """
 
@@ -88,6 +91,11 @@ class Scan:
     rows: int
     open_cells: tuple[tuple[float, float], ...]
     winding: int
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the search was broken off, more motions being worth no more."""
+        return self.motions >= _MOST_MOTIONS
 
     @property
     def degree(self) -> int:
@@ -152,7 +160,8 @@ class _Scanner:
                 some = _Intervals(some[:-1], some[1:], known[..., :-1], known[..., 1:])
             for half in self._halved(some):
                 found, undecided = self._looked_at(half.intervals, half.error)
-                wide = half.intervals.right - half.intervals.left > _NARROWEST
+                wide = (half.intervals.right - half.intervals.left > _NARROWEST) & (motions < _MOST_MOTIONS)
+                wide &= np.all(np.isfinite(half.error), axis=0)
                 zeros += found
                 again = half.intervals.some(np.flatnonzero(undecided & wide))
                 waiting += [again.some(slice(i, i + _BATCH)) for i in range(0, len(again.left), _BATCH)]
@@ -161,7 +170,8 @@ class _Scanner:
                 settled = half.intervals.some(np.flatnonzero(~(undecided & wide)))
                 turned += _turned(settled)
             motions += len(some.left)
-        return Scan(_distinct(zeros, self.dt), motions, self.rows + 1, tuple(open_cells), round(turned / (2 * np.pi)))
+        winding = round(turned / (2 * np.pi)) if math.isfinite(turned) else 0
+        return Scan(_distinct(zeros, self.dt), motions, self.rows + 1, tuple(open_cells), winding)
 
     def _taken(self, waiting: list[Any]) -> Any:
         """The next edges, or as many intervals as fit a batch."""
@@ -182,6 +192,8 @@ class _Scanner:
             each, rows = over_lanes(_window, shared, each)
             parts.append(np.swapaxes(rows, 0, 1))
         table = np.concatenate(parts, axis=1).reshape(4, 2, self.rows + 1, -1)
+        if not (self.coarse or np.all(np.isfinite(table))):
+            raise _TooCoarse
         table /= np.array([1 + self.pendulum.m2, self.pendulum.m2 * self.pendulum.l2**1.5])[:, None, None]
         time = self.dt * np.arange(1, self.rows + 1)[:, None]
         for value, slope in ((0, 1), (2, 3)):

@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,17 +23,18 @@ from dpend.atlas import Atlas, Coverage, is_return, returns, stacked, table_of
 from dpend.families import Family, follow_family, known_pendulum
 from dpend.files import as_json, check_place, replacing
 from dpend.orbits import find_orbit
-from dpend.pendulum import Pendulum, number
+from dpend.pendulum import Pendulum
 from dpend.scan import Zero
-from dpend.trajectory import Status
+from dpend.trajectory import Status, known_number
 
 # Doublings of the slices: this many to begin with, and at most so many. Slices are odd multiples of pi/2^(level + 1).
 _FIRST_LEVELS, _MOST_LEVELS = 5, 10
 # Intervals of theta2 that a slice's scan begins with; more where it leaves a doubt.
 _INTERVALS, _MORE_INTERVALS = 128, 1024
 # Points along families lie no further apart than this [arclength], so that chords between them are true to the second
-# [rad, and log of the period]: what is nearer to a chord belongs to its family.
-_STEP, _NEAR = 0.02, 3e-3
+# [rad, and log of the period], or to the third of their length where releases run faster than arclength: what is nearer
+# to a chord belongs to its family.
+_STEP, _NEAR, _BENT = 0.02, 3e-3, 0.05
 # In a slice, where a curve that runs along it makes more of the same error, partners are this close; where it turns
 # back, two passages of one family.
 _PARTNER, _PAIR = 0.03, 0.1
@@ -42,7 +43,7 @@ _PARTNER, _PAIR = 0.03, 0.1
 def find_brake_families(
     pendulum: Pendulum,
     *,
-    max_period: float,
+    max_period: Any,
     store: str | os.PathLike[str] | None = None,
     progress: Callable[[int, int, int], None] | None = None,
 ) -> Atlas:
@@ -68,7 +69,7 @@ def find_brake_families(
     """
     require_float64()
     fixed = known_pendulum(pendulum)
-    max_period = float(number("max_period", max_period, positive=True, unit="s"))
+    max_period = known_number("max_period", max_period, positive=True, unit="s")
     survey = _Survey(fixed, max_period)
     if store is not None:
         survey = _resumed(survey, Path(store))
@@ -132,14 +133,24 @@ class _Track:
                 chords += [bridge, bridge * flip]
         return _Track(family, seed, level, np.concatenate(chords))
 
-    def away(self, release: np.ndarray) -> float:
-        """How far a point (theta1, theta2, log of the period) is from the nearest chord."""
+    def holds(self, release: np.ndarray) -> bool:
+        """Whether a point (theta1, theta2, log of the period) lies as near to a chord as the curve may be."""
         start, end = self.chords[:, 0], self.chords[:, 1]
         to = release - start
         to[:, :2] -= 2 * np.pi * np.round(to[:, :2] / (2 * np.pi))
         way = end - start
-        share = np.clip(np.sum(to * way, axis=1) / np.maximum(np.sum(way * way, axis=1), 1e-300), 0.0, 1.0)
-        return float(np.min(np.linalg.norm(to - share[:, None] * way, axis=1)))
+        length = np.maximum(np.linalg.norm(way, axis=1), 1e-300)
+        share = np.clip(np.sum(to * way, axis=1) / length**2, 0.0, 1.0)
+        away = np.linalg.norm(to - share[:, None] * way, axis=1)
+        return bool(np.any(away < np.maximum(_NEAR, _BENT * length)))
+
+    def is_same(self, other: "_Track") -> bool:
+        """Whether two were followed along one family: most of the other's orbits lie on this one's curves."""
+        orbits = other.family.orbits
+        points = np.stack(
+            [np.asarray(orbits.theta1), np.asarray(orbits.theta2), np.log(np.asarray(orbits.period))], axis=1
+        )
+        return bool(np.mean([self.holds(point) for point in points]) > 0.5)
 
     def passages(self, theta1: float) -> np.ndarray:
         """(theta2, period) where it passes a slice, shape (n, 2)."""
@@ -205,7 +216,7 @@ class _Survey:
         for track in self.tracks:
             shortest = float(np.exp(np.min(track.chords[:, :, 2])))
             for cover in range(1, int(period / shortest + 1e-3) + 1):
-                if track.away(np.array([theta1, theta2, math.log(period / cover)])) < _NEAR:
+                if track.holds(np.array([theta1, theta2, math.log(period / cover)])):
                     return True
         return False
 
@@ -215,7 +226,14 @@ class _Survey:
         orbit = find_orbit(self.pendulum, theta1, guess=seed[1:])
         if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
             return False
-        self.tracks.append(self._track(seed, level))
+        new = self._track(seed, level)
+        for i, track in enumerate(self.tracks):
+            if track.is_same(new):
+                # Met where its chords were not near enough; the one that was followed further stays.
+                if len(new.chords) > len(track.chords):
+                    self.tracks[i] = replace(new, level=track.level)
+                return True
+        self.tracks.append(new)
         return self._known(*seed)
 
     def _track(self, seed: tuple[float, float, float], level: int) -> _Track:

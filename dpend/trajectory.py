@@ -164,6 +164,22 @@ def known_value(value: Scalar) -> float | None:
         return None
 
 
+def known_number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> float:
+    """The finite number behind an argument that must be one here, also under eager differentiation.
+
+    Raises:
+        ValueError: it is none, traced by `jit`, an array, text, or with `positive` not above zero.
+    """
+    value = number(name, value, positive=positive, unit=unit)
+    try:
+        known = None if isinstance(value, bool) else known_value(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a single number, got {value!r}: give a number") from None
+    if known is None:
+        raise ValueError(f"{name} must be a number here, not traced by jit or a boolean, got {value!r}: give a number")
+    return float(number(name, known, positive=positive, unit=unit))
+
+
 # A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns ten thousand times
 # as fast as any that gravity moves: the lane is given up as NaN, so that no other waits for it.
 _SHORTEST_STEP = 1e-5

@@ -111,11 +111,13 @@ def test_filters(forty):
     assert len(forty.where(energy=(-1.0, np.median(forty.table["energy"])))) == 4
     nothing = forty.where(period=(3, 4))
     assert (len(nothing), nothing.orbits) == (0, ())
+    assert len(nothing.where(symmetry="brake")) == 0
     for wrong, text in (
         ({"period": (1, 2, 3)}, "period must be a pair"),
         ({"kappa": (1, -1)}, "kappa must be a pair"),
         ({"symmetry": "odd"}, "symmetry must be one of brake, centred"),
-        ({"family": ["C1"]}, "family must be one of"),
+        ({"family": ["C1"]}, "family must be one of none"),
+        ({"symmetry": 3}, "symmetry must be one of"),
     ):
         with pytest.raises(ValueError, match=text):
             forty.where(**wrong)
@@ -142,6 +144,30 @@ def test_bad_requests_are_refused(paper, change, text):
     request = {"pendulum": paper, "theta1": 1.0, "max_period": 1.0} | change
     with pytest.raises(ValueError, match=text):
         dpend.find_brake_orbits(request.pop("pendulum"), **request)
+
+
+@pytest.mark.parametrize("wrong", [None, np.array([1.0, 2.0]), True, "1", 1j])
+def test_what_is_no_number_is_refused(paper, wrong):
+    with pytest.raises(ValueError, match="theta1 must be"):
+        dpend.find_brake_orbits(paper, theta1=wrong, max_period=1.0)
+    with pytest.raises(ValueError, match="max_period must be"):
+        dpend.find_brake_orbits(paper, theta1=1.0, max_period=wrong)
+
+
+def test_traced_requests_are_refused(paper):
+    with pytest.raises(ValueError, match="theta1 must be a number here, not traced"):
+        jax.jit(lambda x: dpend.find_brake_orbits(paper, theta1=x, max_period=1.0).table["period"][0])(1.0)
+
+
+@pytest.mark.parametrize("theta1", [1e-6, 1e-9, -1e-6])
+def test_tiny_swings(paper, theta1):
+    """The fast mode, and the oscillation about the state with the lower rod upright, however small."""
+    found = dpend.find_brake_orbits(paper, theta1=theta1, max_period=0.85)
+    _, fast = dpend.normal_modes(paper)
+    upright = 2 * np.pi / np.max(np.imag(dpend.equilibria(paper).exponents[1]))
+    np.testing.assert_allclose(found.table["period"], [fast.period, upright], rtol=1e-6)
+    np.testing.assert_allclose(found.table["theta2"][0] / theta1, fast.ratio, rtol=1e-6)
+    assert found.coverage.suspicious_cells == 0
 
 
 def test_files_that_are_no_atlas(forty, tmp_path):

@@ -298,6 +298,29 @@ def test_changes_within_one_step_are_found():
 
 
 @pytest.mark.slow
+def test_orbits_are_not_held_twice(paper):
+    """Through a point where a brake orbit becomes more symmetric its family goes on with the same orbits at their other
+    rests: from an orbit on it, it ends there. The energies are then all different."""
+    orbit = dpend.find_orbit(paper, np.radians(90.0), guess=(np.radians(-7.85), 2.5454))
+    family = dpend.follow_family(paper, orbit, longest_period=2.6)
+    assert family.ends == ("branch point", "longest period")
+    np.testing.assert_allclose(family.orbits.period[-1], 2.6, rtol=1e-12)
+    assert np.all(np.diff(family.orbits.period) > 0)
+
+
+def test_families_up_to_a_period(unit):
+    family = dpend.follow_family(unit, "anti-phase", longest_period=6.0)
+    assert (family.ends, int(family.status)) == (("normal mode", "longest period"), Status.CONVERGED)
+    np.testing.assert_allclose(family.orbits.period[-1], 6.0, rtol=1e-13)
+    orbit = single(family.orbits, -1)
+    found = dpend.find_orbit(unit, float(orbit.theta1), branch="anti-phase")
+    np.testing.assert_allclose([orbit.theta2, orbit.period], [found.theta2, found.period], rtol=1e-12)
+    for start in ("anti-phase", found):
+        with pytest.raises(ValueError, match="longest_period must be longer"):
+            dpend.follow_family(unit, start, longest_period=3.0)
+
+
+@pytest.mark.slow
 def test_what_branches_off_at_c_of_minus_one():
     """With Phi(T/2) = [[A, B], [C, D]]: where C vanishes on a release, brake orbits that are not centred, at rest after
     half a period by diffrax; where B vanishes the displacement is of the momenta alone, and there is no rest.
