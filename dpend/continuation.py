@@ -264,7 +264,15 @@ def without_its_image(rows: Corrected, ends: tuple[str, str], here: int) -> tupl
     return rows, ends
 
 
-def _reflects(rows: Corrected, crossing: int) -> bool:
+def half_of_closed(rows: Corrected) -> Corrected | None:
+    """Of a closed curve that holds its orbits twice, from one branch point to another and back, the half it begins in."""
+    (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
+    if crossings.size < 2 or not _reflects(rows, crossings[0]):
+        return None
+    return joined(some_of(rows, slice(crossings[-1] + 1, None)), some_of(rows, slice(crossings[0] + 1)))
+
+
+def _reflects(rows: Corrected, crossing: Any) -> bool:
     """Whether the points on both sides of a crossing are each other's images: their orbits' other rests, in the mirror
     or not.
     """

@@ -24,6 +24,7 @@ from dpend.continuation import (
     Reach,
     begun,
     curve_of,
+    half_of_closed,
     joined,
     laid_out,
     repeated,
@@ -718,11 +719,12 @@ def _both_ways(problem: Problem, rows: Corrected, reach: Reach) -> Family:
 
 def _closed(problem: Problem, start: Corrected, ahead: Corrected) -> Family:
     """A curve that comes back to its beginning: to the same rest, which is then its last point too, or to the other."""
-    rows = joined(start, ahead)
-    gap = np.sqrt(np.sum(METRIC * (ahead.point[-1] - start.point[0]) ** 2))
-    if gap < 2 * curve_of(rows).lengths[-1]:
+    rows, ends = joined(start, ahead), ("closed", "closed")
+    if problem.symmetry == "brake" and (half := half_of_closed(rows)) is not None:
+        rows, ends = half, ("branch point", "branch point")
+    elif np.sqrt(np.sum(METRIC * (ahead.point[-1] - start.point[0]) ** 2)) < 2 * curve_of(rows).lengths[-1]:
         rows = joined(rows, start)
-    return _family(problem, rows, curve_of(rows), ("closed", "closed"))
+    return _family(problem, rows, curve_of(rows), ends)
 
 
 def _family(problem: Problem, rows: Corrected, curve: Curve, ends: tuple[str, str]) -> Family:

@@ -1,8 +1,9 @@
 """The atlas of the paper's pendulum: every family of orbits released from rest with a period of at most 2 s.
 
-It is saved beside this script as `atlas/brake_orbits.csv` and `.json` (columns and units: README.md here). Two pictures:
-all families in the square of both release angles over the Lyapunov exponent of the motions in between, and one orbit
-of each. Stopped and started again, the search goes on from a store beside the catalogue, which is deleted at the end.
+It is saved beside this script as `atlas/brake_orbits.csv` and `.json` (columns and units: README.md here). Two
+pictures: all families in the square of both release angles over the Lyapunov exponent of the motions in between, and
+one orbit of each. Stopped and started again, the search goes on from a store beside the catalogue, which is deleted at
+the end.
 
 That nothing is missing is spoken for by counts that know nothing of families: how often the momenta at the last time
 wind round zero as theta2 goes once round, which is the sum of the signs of all returns to rest on a slice. That what is
@@ -10,7 +11,6 @@ there is right, by `atlas_check.py`, which integrates every row of the file by o
 """
 
 import argparse
-import json
 import tempfile
 import time
 from functools import partial
@@ -29,8 +29,8 @@ HERE = Path(__file__).parent
 # Without its palest yellows, which would be lost on the grey.
 PERIODS = matplotlib.colors.ListedColormap(matplotlib.colormaps["plasma"](np.linspace(0, 0.87, 256)))
 GREYS = matplotlib.colors.LinearSegmentedColormap.from_list("pale", ["#ffffff", "#c4c4c4"])
-# Pixels between a name and what is nearest to it.
-ROOM = 15.0
+# Pixels between a name and its curve.
+ROOM = 22.0
 
 
 def found(max_period: float, folder: Path) -> dpend.Atlas:
@@ -100,13 +100,13 @@ def curve_of(atlas: dpend.Atlas, record: dict) -> tuple[list[np.ndarray], np.nda
 
 
 def wrapped(curve: np.ndarray) -> np.ndarray:
-    """The pieces of a curve on the square, shape (n - 1, 2, 2): by its first point, and over the edge as far as it goes."""
+    """The pieces of a curve, shape (n - 1, 2, 2), each where its middle is on the square."""
     pieces = np.stack([curve[:-1], curve[1:]], axis=1)
     return pieces - 360 * np.round(np.mean(pieces, axis=1, keepdims=True) / 360)
 
 
 def square(atlas: dpend.Atlas, cells: int, path: Path) -> None:
-    fig, ax = plt.subplots(figsize=(9, 7.9), layout="constrained")
+    fig, ax = plt.subplots(figsize=(9, 8.9), layout="constrained")
     angles = np.pi * (np.arange(cells) + 0.5 - cells / 2) / (cells / 2)
     field = dpend.sweep(
         partial(chaos.lyapunov, duration=10.0), atlas.pendulum, {"theta1": angles, "theta2": angles}, tolerance=1e-6
@@ -132,24 +132,26 @@ def square(atlas: dpend.Atlas, cells: int, path: Path) -> None:
     ax.set(xlim=(-180, 180), ylim=(-180, 180), xlabel="theta1 (deg)", ylabel="theta2 (deg)", aspect="equal")
     ax.set(xticks=range(-180, 181, 45), yticks=range(-180, 181, 45))
     fig.colorbar(lines, ax=ax, label="period (s)", pad=0.02, fraction=0.05)
-    fig.colorbar(map_, ax=ax, label="Lyapunov exponent over 10 s (1/s)", pad=0.02, fraction=0.05, extend="max")
+    below = {"location": "bottom", "pad": 0.02, "fraction": 0.03, "aspect": 50}
+    fig.colorbar(map_, ax=ax, label="Lyapunov exponent over 10 s (1/s)", extend="both", **below)
+    outline = [withStroke(linewidth=6.0, foreground="black")]
+    handles = [
+        plt.Line2D([], [], linewidth=3.6, color=PERIODS(0.4), label="stable", path_effects=outline),
+        plt.Line2D([], [], linewidth=1.5, color=PERIODS(0.4), label="unstable"),
+    ]
+    ax.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, handlelength=3)
     fig.canvas.draw()
     named(ax, drawn)
-    kinds = {"stable": (6.0, 3.6), "unstable": (0.0, 1.5)}
-    handles = [
-        plt.Line2D([], [], linewidth=inner, color=PERIODS(0.4), label=label)
-        if not outer
-        else plt.Line2D(
-            [], [], linewidth=inner, color=PERIODS(0.4), label=label, path_effects=[withStroke(linewidth=outer)]
-        )
-        for label, (outer, inner) in kinds.items()
-    ]
-    fig.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False)
     saved(fig, path)
 
 
+def nearest(points: np.ndarray, others: np.ndarray, across: float) -> np.ndarray:
+    """How far from each point the nearest of the others is, what is across shortened."""
+    return np.min(np.linalg.norm((points[:, None] - others) * [across, 1.0], axis=-1), axis=1)
+
+
 def named(ax: plt.Axes, drawn: dict[str, list[np.ndarray]]) -> None:
-    """Each family's name once, beside its own curve where there is most room."""
+    """Each family's name once, where there is most room for it and its curve is far from all others."""
     pixels = {
         name: [ax.transData.transform(pieces.reshape(-1, 2)).reshape(-1, 2, 2).mean(axis=1) for pieces in curves]
         for name, curves in drawn.items()
@@ -162,16 +164,18 @@ def named(ax: plt.Axes, drawn: dict[str, list[np.ndarray]]) -> None:
         way = np.gradient(points, axis=0)
         normal = np.column_stack([-way[:, 1], way[:, 0]]) / np.maximum(np.hypot(*way.T), 1e-9)[:, None]
         spots = np.concatenate([points + side * ROOM * normal for side in (-1, 1)])
-        inside = (spots[:, 0] > left + 14) & (spots[:, 0] < right - 14) & (spots[:, 1] > low + 10)
-        spots = spots[inside & (spots[:, 1] < high - 10)]
+        inside = np.all((spots > [left + 15, low + 10]) & (spots < [right - 15, high - 10]), axis=1)
+        spots, feet = spots[inside], np.concatenate([points, points])[inside]
+        others = np.concatenate([points for other in pixels if other != name for points in pixels[other]])
         # A name is wider than it is high.
-        apart = (spots[:, None] - taken) * np.array([0.7, 1.0])
-        place = spots[np.argmax(np.min(np.hypot(*np.moveaxis(apart, -1, 0)), axis=1))]
-        around = place + np.array([[x, y] for x in np.linspace(-14, 14, 8) for y in (-8, 0, 8)])
-        taken = np.concatenate([taken, around])
-        ax.text(
-            *ax.transData.inverted().transform(place), name, ha="center", va="center", fontsize=11, fontweight="bold",
-            zorder=5, path_effects=[withStroke(linewidth=3, foreground="white")],
+        best = np.argmax(np.minimum(nearest(spots, taken, 0.7), nearest(feet, others, 1.0)))
+        box = np.stack(np.meshgrid(np.linspace(-15, 15, 8), [-8, 0, 8]), axis=-1).reshape(-1, 2)
+        taken = np.concatenate([taken, spots[best] + box])
+        ax.annotate(
+            name, ax.transData.inverted().transform(feet[best]), ax.transData.inverted().transform(spots[best]),
+            ha="center", va="center", fontsize=11, fontweight="bold", zorder=5,
+            arrowprops={"arrowstyle": "-", "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0},
+            path_effects=[withStroke(linewidth=3, foreground="white")],
         )  # fmt: skip
 
 
@@ -215,6 +219,7 @@ def sheet(atlas: dpend.Atlas, path: Path) -> None:
     rows = {kind: -(-len(records) // 4) for kind, records in groups.items()}
     fig = plt.figure(figsize=(9, 2.85 * sum(rows.values()) + 0.4 * len(rows)), layout="constrained")
     parts = np.atleast_1d(fig.subfigures(len(groups), 1, height_ratios=list(rows.values())))
+    fig.get_layout_engine().set(h_pad=0.08)
     told = {"centred": "Centred: both rods vertical at T/4", "brake": "Brake: at rest at T/2, never vertical together"}
     for part, (kind, records) in zip(parts, groups.items(), strict=True):
         part.suptitle(told[kind], fontsize=11, fontweight="bold")
@@ -223,6 +228,9 @@ def sheet(atlas: dpend.Atlas, path: Path) -> None:
             panel(ax, record["family"], example(atlas, record))
         for ax in axes[len(records) :]:
             ax.axis("off")
+    parts[-1].supxlabel(
+        "path of the lower bob over one period; rods at the release (solid) and at the other rest (dashed)", fontsize=9
+    )
     saved(fig, path)
 
 
