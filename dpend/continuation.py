@@ -265,7 +265,7 @@ def without_its_image(rows: Corrected, ends: tuple[str, str], here: int) -> tupl
 
 
 def half_of_closed(rows: Corrected) -> Corrected | None:
-    """Of a closed curve that holds its orbits twice, from one branch point to another and back, the half it begins in."""
+    """Of a closed curve that holds its orbits twice, from a branch point to another and back, the half it begins in."""
     (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
     if crossings.size < 2 or not _reflects(rows, crossings[0]):
         return None
