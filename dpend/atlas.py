@@ -138,7 +138,7 @@ class Atlas:
         path = Path(path)
         check_place("path", path, (".csv", ".json"))
         with replacing(path) as draft:
-            draft.write_text(as_json(self.record()) + "\n" if path.suffix == ".json" else self._csv())
+            draft.write_text(self._json() if path.suffix == ".json" else self._csv())
 
     def _about(self) -> dict[str, Any]:
         import dpend
@@ -152,6 +152,12 @@ class Atlas:
             "coverage": asdict(self.coverage),
             "families": list(self.families),
         }
+
+    def _json(self) -> str:
+        """An orbit a line: files are read by people and compared by lines, too."""
+        record = self.record()
+        lines = (" ".join(as_json(orbit).split()) for orbit in record.pop("orbits"))
+        return as_json(record).removesuffix("\n}") + ',\n  "orbits": [\n    ' + ",\n    ".join(lines) + "\n  ]\n}\n"
 
     def _csv(self) -> str:
         text = io.StringIO()
@@ -205,8 +211,7 @@ _UNITS = {
     "period_error": "s",
     "energy": "J",
 }
-# Columns and their types; of the columns without a unit `residual` is in rad and m2 l2 sqrt(g l2), `arclength` as in
-# `Family`.
+# Columns and their types; those without a unit here are as in `PeriodicOrbit` and `Family`.
 _COLUMNS: dict[str, type] = {
     "family": str,
     "arclength": float,

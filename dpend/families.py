@@ -258,7 +258,10 @@ def _orbits(problem: Problem, rows: Corrected, targets: Any = None, along: Any =
         residual=rows.residual,
         iterations=rows.iterations.astype(int),
         turns=(whole[:, 0], whole[:, 1]),
-        error_estimate=(rows.angle_error, rows.time_error * period),
+        error_estimate=(
+            np.maximum(rows.angle_error, np.finfo(float).eps * np.abs(rows.point[:, 1])),
+            np.maximum(rows.time_error, np.finfo(float).eps) * period,
+        ),
         status=np.where(rows.converged > 0, int(Status.CONVERGED), int(Status.MAX_ITERATIONS)),
         symmetry=problem.symmetry,
     )

@@ -35,6 +35,8 @@ BRANCHES = ("in-phase", "anti-phase")
 SYMMETRIES = ("centred", "brake")
 
 _RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
+# No number is better known than this, relative to itself.
+_LAST_BIT = sys.float_info.epsilon
 # rate times step [rad]: leaves errors of rounding in theta2 and T.
 _FINE = 0.1
 # A number of steps at which a motion cannot be what was meant: the search is lost.
@@ -440,6 +442,7 @@ def _solved(
         x, log_time = both.x[1] + both.update[1, 0], both.log_time[1] + both.update[1, 1]
         period = PARTS[symmetry] * jnp.exp(newton.log_time)
         change = jnp.stack([jnp.abs(x - newton.x), period * jnp.abs(jnp.expm1(log_time - newton.log_time))])
+        change = jnp.maximum(change, _LAST_BIT * jnp.stack([jnp.abs(newton.x), period]))
         change = jnp.where(both.status[1] == Status.CONVERGED, change, jnp.nan)
     return newton, steps, change
 

@@ -10,10 +10,10 @@ with both its rests.
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -61,8 +61,8 @@ def find_brake_families(
         Atlas, family by family, in order of arclength from the end with the shorter period. Families are called C1, C2
         (centred) and B1, B2 (brake) in order of their shortest period, so that a name does not depend on how a family
         was found, nor on `max_period`. Their records: `family`, `symmetry`, `ends` as in `Family` (`longest period`
-        where it goes on beyond max_period), `shortest_period_s` and `longest_period_s` within, `special_points` with
-        kind, arclength, release in degrees, period and kappa.
+        where it goes on beyond max_period), `shortest_period_s` on it (the limit where it shrinks onto a normal mode)
+        and `longest_period_s`, `special_points` with kind, arclength, release in degrees, period and kappa.
     Raises:
         ValueError: max_period not positive, g not positive, a traced argument; a store made with other settings.
         RuntimeError: float64 is switched off in JAX.
@@ -90,13 +90,6 @@ def find_brake_families(
 
 
 # --- families as curves of releases -----------------------------------------------------------------------------------
-
-
-class _Hit(NamedTuple):
-    """A slice's return to rest."""
-
-    zero: Zero
-    theta1: float
 
 
 @dataclass(frozen=True)
@@ -268,7 +261,7 @@ class _Survey:
 
     def atlas(self, level: int) -> Atlas:
         entries = [_entry(track.family, self.max_period) for track in self.tracks]
-        entries.sort(key=lambda entry: entry[1]["shortest_period_s"])
+        entries = _in_order(entries)
         numbers = {"centred": 0, "brake": 0}
         tables, records = [], []
         for table, record in entries:
@@ -315,7 +308,46 @@ def _without_pairs(points: np.ndarray) -> np.ndarray:
     return points[np.min(apart, axis=1, initial=np.inf) > _PAIR]
 
 
-def _entry(family: Family, max_period: float) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+# Families with shortest periods this near to each other, relative, as the oscillations about both saddles of equal rods
+# and masses have, go by their energies there.
+_TIE = 1e-6
+
+_Entry: TypeAlias = tuple[dict[str, np.ndarray], dict[str, Any]]
+
+
+def _in_order(entries: list[_Entry]) -> list[_Entry]:
+    ordered: list[list[_Entry]] = []
+    for entry in sorted(entries, key=lambda entry: entry[1]["shortest_period_s"]):
+        period = entry[1]["shortest_period_s"]
+        if ordered and period < ordered[-1][0][1]["shortest_period_s"] * (1 + _TIE):
+            ordered[-1].append(entry)
+        else:
+            ordered.append([entry])
+
+    def energy(entry: _Entry) -> float:
+        return float(entry[0]["energy"][np.argmin(entry[0]["period"])])
+
+    return [entry for tied in ordered for entry in sorted(tied, key=energy)]
+
+
+def _shortest(table: dict[str, np.ndarray], ends: Sequence[str]) -> float:
+    """The shortest period on a family, whatever its points: a parabola's between points, and where it shrinks onto a
+    normal mode the limit, from which the period parts with the square of the swing.
+    """
+    period, where = table["period"], table["arclength"]
+    i, last = int(np.argmin(period)), len(period) - 1
+    if 0 < i < last:
+        fit = np.polynomial.Polynomial.fit(where[i - 1 : i + 2], period[i - 1 : i + 2], 2)
+        return float(fit(fit.deriv().roots()[0].real))
+    if last > 0 and ends[0 if i == 0 else -1] == "normal mode":
+        two = [i, i + 1] if i == 0 else [i, i - 1]
+        angles = np.stack([table["theta1"][two], table["theta2"][two]])
+        first, second = np.sum((angles - np.pi * np.round(angles / np.pi)) ** 2, axis=0)
+        return float(period[i] - (period[two[1]] - period[i]) * first / (second - first))
+    return float(period[i])
+
+
+def _entry(family: Family, max_period: float) -> _Entry:
     """The rows of a family within the longest period, and its record; turned and mirrored into a standard form."""
     orbits = jax.tree.map(np.asarray, family.orbits)
     period = np.asarray(orbits.period)
@@ -334,11 +366,12 @@ def _entry(family: Family, max_period: float) -> tuple[dict[str, np.ndarray], di
         table[f"turns{number_}"] = sign * table[f"turns{number_}"] - (2 * int(shift) if centred else 0)
     inside = table["period"] <= max_period * (1 + 1e-12)
     kept = {key: column[inside] for key, column in table.items()}
+    ends = list(family.ends[::-1] if back else family.ends)
     record = {
         "symmetry": family.symmetry,
-        "ends": list(family.ends[::-1] if back else family.ends),
+        "ends": ends,
         "status": Status(int(family.status)).name.lower(),
-        "shortest_period_s": float(kept["period"].min()),
+        "shortest_period_s": _shortest(kept, ends),
         "longest_period_s": float(kept["period"].max()),
         "special_points": [
             {

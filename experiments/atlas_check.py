@@ -120,9 +120,9 @@ def checked(pendulum, rows):
     centred = np.array([row["symmetry"] == "centred" for row in rows])
     half_turns = quarter[:, :2] / np.pi
     turns = np.where(centred[:, None], np.column_stack([column["turns1"], column["turns2"]]), np.round(half_turns))
-    leaning = np.max(np.abs(half_turns - turns), axis=1)
     moving = np.minimum(*(np.max(np.abs(state[:, 2:]), axis=1) / rate for state in (sixth, quarter)))
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
+        leaning = np.max(np.abs(half_turns - turns), axis=1)
         found = {
             "return": error / (TOLERANCE * growth),
             "dual": apart(half, dual, rate) / (TOLERANCE * np.sqrt(growth)),

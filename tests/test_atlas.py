@@ -1,6 +1,7 @@
 """The atlas of one release angle: known orbits, other integrators, invariances, and its file."""
 
 import json
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,6 +10,8 @@ from test_scan import FORTY
 
 import dpend
 from dpend import Pendulum, Status
+
+CATALOGUE = Path(__file__).parent.parent / "experiments" / "atlas"
 
 
 @pytest.fixture(scope="module")
@@ -179,3 +182,20 @@ def test_files_that_are_no_atlas(forty, tmp_path):
         (tmp_path / name).write_text(text)
         with pytest.raises(ValueError, match="path must be a file that Atlas.save wrote"):
             dpend.load_atlas(tmp_path / name)
+
+
+def test_the_published_catalogue(paper):
+    """Both files hold the same orbits; a few of each family are solved again from their digits."""
+    atlas, same = (dpend.load_atlas(CATALOGUE / f"brake_orbits.{ending}") for ending in ("csv", "json"))
+    assert [one["family"] for one in atlas.families if one["symmetry"] == "brake"] == [f"B{i}" for i in range(1, 7)]
+    assert (atlas.coverage.suspicious_cells, atlas.coverage.degree) == (0, atlas.coverage.winding)
+    for key, column in atlas.table.items():
+        np.testing.assert_array_equal(column, same.table[key])
+    for one in atlas.families:
+        for orbit in atlas.where(family=one["family"]).orbits[5::45]:
+            again = dpend.find_orbit(paper, orbit.theta1, guess=(orbit.theta2, orbit.period))
+            found = [again.theta2, again.period, again.dual.theta1, again.dual.theta2, again.energy]
+            known = [orbit.theta2, orbit.period, orbit.dual.theta1, orbit.dual.theta2, orbit.energy]
+            np.testing.assert_allclose(found, known, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(again.kappa, orbit.kappa, rtol=1e-6, atol=1e-6)
+            assert again.symmetry == orbit.symmetry

@@ -30,7 +30,7 @@ def test_the_only_family_below_the_period_of_every_other_mode(paper):
     assert (found.coverage.suspicious_cells, found.coverage.slices) == (0, 31)
     assert found.coverage.degree == found.coverage.winding
     _, fast = dpend.normal_modes(paper)
-    np.testing.assert_allclose(only["shortest_period_s"], fast.period, rtol=2e-4)
+    np.testing.assert_allclose(only["shortest_period_s"], fast.period, rtol=1e-8)
     assert np.all(np.diff(found.table["period"]) > 0)
     assert np.all(np.diff(found.table["energy"]) > 0)
 
@@ -45,7 +45,7 @@ def test_families_that_begin_in_equilibrium_have_its_period(square, paper):
     assert set(families) == {"C1", "C2", "C3", "C4", "B1"}
     for name, period in periods.items():
         assert families[name]["ends"][0] == "normal mode"
-        np.testing.assert_allclose(families[name]["shortest_period_s"], period, rtol=2e-4)
+        np.testing.assert_allclose(families[name]["shortest_period_s"], period, rtol=1e-8)
     assert families["B1"]["ends"][0] == "branch point"
     assert [one["ends"][1] for one in families.values()] == ["longest period"] * 5
 
@@ -59,7 +59,8 @@ def test_the_catalogue_accounts_for_itself(square):
     for one in square.families:
         rows = square.where(family=one["family"]).table
         assert np.all(np.diff(rows["arclength"]) > 0)
-        assert (rows["period"].min(), rows["period"].max()) == (one["shortest_period_s"], one["longest_period_s"])
+        assert one["shortest_period_s"] <= rows["period"].min() < one["shortest_period_s"] * (1 + 1e-4)
+        assert rows["period"].max() == one["longest_period_s"]
         np.testing.assert_allclose(rows["period"].max(), LONGEST, rtol=1e-12)
         assert set(rows["symmetry"].tolist()) == {one["symmetry"]}
 
@@ -132,7 +133,7 @@ def test_names_do_not_depend_on_the_longest_period(square, paper):
     names = [one["family"] for one in shorter.families]
     assert names == [one["family"] for one in square.families]
     for one, other in zip(shorter.families, square.families, strict=True):
-        np.testing.assert_allclose(one["shortest_period_s"], other["shortest_period_s"], rtol=1e-4)
+        np.testing.assert_allclose(one["shortest_period_s"], other["shortest_period_s"], rtol=1e-8)
 
 
 @slow
