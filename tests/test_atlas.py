@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from test_families import monodromy
 from test_scan import FORTY
 
 import dpend
@@ -45,8 +46,7 @@ def test_every_row_is_an_orbit(forty, paper):
         np.testing.assert_allclose(states[2:], 0, atol=1e-12 * growth)
         assert orbit.residual < 1e-12 * growth
         assert max(orbit.error_estimate) < 1e-9
-        matrix = dpend.monodromy(paper, orbit.state, float(whole), dpend.Scheme("rk8", 1e-3))
-        np.testing.assert_allclose((np.trace(matrix) - 2) / 2, orbit.kappa, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose((np.trace(monodromy(orbit, 1.0)) - 2) / 2, orbit.kappa, rtol=1e-7, atol=1e-7)
         np.testing.assert_allclose(dpend.hamiltonian(paper, orbit.state), orbit.energy, rtol=1e-14)
 
 
@@ -67,6 +67,7 @@ def test_mirror_turns_and_units(forty):
     np.testing.assert_allclose(mirrored.table["period"], scale * forty.table["period"], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_mirror_images_are_listed_once_where_the_upper_rod_hangs(paper):
     """Released with the upper rod straight down or up, theta2 and -theta2 are one orbit; and the equilibria none."""
     down = dpend.find_brake_orbits(paper, theta1=0.0, max_period=2.0)
@@ -162,7 +163,7 @@ def test_traced_requests_are_refused(paper):
         jax.jit(lambda x: dpend.find_brake_orbits(paper, theta1=x, max_period=1.0).table["period"][0])(1.0)
 
 
-@pytest.mark.parametrize("theta1", [1e-6, 1e-9, -1e-6])
+@pytest.mark.parametrize("theta1", [pytest.param(1e-9, marks=pytest.mark.slow), -1e-6])
 def test_tiny_swings(paper, theta1):
     """The fast mode, and the oscillation about the state with the lower rod upright, however small."""
     found = dpend.find_brake_orbits(paper, theta1=theta1, max_period=0.85)

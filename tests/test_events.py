@@ -98,6 +98,7 @@ def test_what_does_not_count_is_passed_by(paper, name):
         np.testing.assert_allclose(found.time, alone.time, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_tiny_values_cross_where_they_cross(paper):
     """The product of two values below 1e-162 is zero, and no change of sign."""
     found = dpend.first_crossing(

@@ -184,6 +184,7 @@ def test_derivatives_of_orbits(unit):
     assert abs(kappa[0] * base[0] + kappa[1] * base[1]) < 1e-13
 
 
+@pytest.mark.slow
 def test_derivatives_that_do_not_exist():
     """At a fold in theta1 the slopes in arclength are finite, and the derivative with respect to theta1 is refused."""
     heavy_below = Pendulum(1.0, 1.0, 1.0, 0.1, 1.0)
@@ -208,7 +209,8 @@ def test_derivatives_that_do_not_exist():
         jax.jit(lambda theta1: family.at(theta1).period)(0.1)
 
 
-@pytest.mark.parametrize("branch", [pytest.param("in-phase", marks=pytest.mark.slow), "anti-phase"])
+@pytest.mark.slow
+@pytest.mark.parametrize("branch", BOTH)
 def test_orbits_with_no_rest_branch_off_where_stability_is_lost(unit, families, branch):
     """x(T/2) = -x(0) by diffrax, momenta that are not zero, and the stability that the old family gave away."""
     lost = families[branch].special_points[-1]

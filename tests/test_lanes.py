@@ -91,7 +91,8 @@ def test_results_of_any_shape_come_lanes_last(paper):
     np.testing.assert_array_equal(out["one"], states.theta1)
 
 
-@pytest.mark.parametrize("devices", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("devices", [1, 3])
 def test_number_of_devices_does_not_change_a_bit(paper, devices, tmp_path):
     code = f"""
 import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})

@@ -152,7 +152,7 @@ def test_small_swings_are_the_normal_modes(paper):
     ("pendulum", "angles"),
     [
         # l2/l1, m2/m1 and where the in-phase branch turns back, and turns again [deg].
-        ((1.0, 0.1), (17.77, 5.43)),
+        pytest.param((1.0, 0.1), (17.77, 5.43), marks=pytest.mark.slow),
         pytest.param((1.0, 0.01), (3.07, 0.60), marks=pytest.mark.slow),
         ((10.0, 1.0), (46.57, 24.30)),
     ],

@@ -3,10 +3,10 @@
 import jax
 import numpy as np
 import pytest
+from test_families import monodromy
 
 import dpend
 from dpend import Pendulum, survey
-from dpend.stability import transition
 
 LONGEST = 1.25
 # All but the first, which the quick suite has.
@@ -76,8 +76,7 @@ def test_rows_are_orbits(square, paper):
         states = np.stack(jax.tree.leaves(end))[:, 0]
         np.testing.assert_allclose(states[:2], [orbit.dual.theta1, orbit.dual.theta2], atol=1e-11 * growth)
         np.testing.assert_allclose(states[2:], 0, atol=1e-12 * growth)
-        _, matrix = transition(paper, orbit.state, orbit.period / 1600, 1600, dpend.Scheme("rk8", 1.0))
-        np.testing.assert_allclose((np.trace(matrix) - 2) / 2, orbit.kappa, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose((np.trace(monodromy(orbit, 1.0)) - 2) / 2, orbit.kappa, rtol=1e-6, atol=1e-6)
 
 
 @slow

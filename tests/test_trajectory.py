@@ -54,7 +54,7 @@ def test_a_light_lower_bob_leaves_a_simple_pendulum():
     assert abs(end.theta1) < 1e-8
 
 
-@pytest.mark.parametrize("steps", [100, 1500])
+@pytest.mark.parametrize("steps", [100, pytest.param(1500, marks=pytest.mark.slow)])
 def test_reverse_mode_agrees_with_forward_mode(paper, steps):
     """Short motions, and long ones that are checkpointed."""
     scheme = Scheme("rk8", 1.0 / steps)
@@ -126,7 +126,11 @@ def test_simulate_saves_what_was_asked(paper):
 
 @pytest.mark.parametrize(
     "options",
-    [{"step": 1e-3, "method": "rk4"}, pytest.param({"step": 5e-3}, marks=pytest.mark.slow), {"tolerance": 1e-8}],
+    [
+        {"step": 1e-3, "method": "rk4"},
+        pytest.param({"step": 5e-3}, marks=pytest.mark.slow),
+        pytest.param({"tolerance": 1e-8}, marks=pytest.mark.slow),
+    ],
 )
 def test_error_estimate_is_the_error(paper, options):
     motion = dpend.simulate(paper, RELEASE, 2.0, **options)

@@ -54,6 +54,7 @@ def test_nan_beyond_what_can_be_reduced():
     assert errors(np.array([trig.LARGEST_ANGLE, -trig.LARGEST_ANGLE])).max() < 2.0
 
 
+@pytest.mark.slow
 def test_derivatives_of_all_orders():
     def both(x):
         return jnp.stack(trig.sincos(x))
