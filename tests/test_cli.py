@@ -265,6 +265,7 @@ def test_bad_input_is_one_line_and_status_two(capsys, arguments, words):
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_the_program_itself(tmp_path):
     """A process of its own: entry point, cache directory, and the compile options switched off."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "DPEND_PLAIN_JAX": "1"}
