@@ -231,6 +231,7 @@ def test_orbits_with_no_rest_branch_off_where_stability_is_lost(unit, families, 
         np.testing.assert_allclose(orbit.kappa, kappa, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_orbits_of_twice_and_three_times_the_period(unit, families):
     """Brake orbits branch off at c = 0 and c = 1/2; those of twice the period run from one c = 0 to the next."""
     first, second = (point for point in families["in-phase"].special_points[:2])
