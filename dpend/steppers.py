@@ -8,8 +8,9 @@ point that a step moves is not always a `State`. There are two forms:
   more sums that nothing depends on. No step computes a sine, which is half of the canonical form's work. Another
   discretisation of the same equations: s^2 + c^2 = 1 holds to the method's error, no better.
 
-`gauss` is implicit, of order 6 and symplectic: energy errors do not grow with time. Its point is a canonical state with
-the rounding errors of all sums so far, which the next sum takes back.
+`gauss` is implicit, of order 6 and symplectic: the energy error does not grow with time, but for a part that vanishes
+exponentially with the step (the paper's orbit at 40 degrees loses 2e-14 of its energy a period with 40 steps in it, 1e-17
+with 60). Its point is a canonical state with the rounding errors of all sums so far, which the next sum takes back.
 
 The rescaled method takes equal steps in a time s of its own, dt/ds = u^(-5/8) with u = 1 + 0.85 q/omega_f^2,
 q = omega1^2 + omega2^2 + (omega1 - omega2)^2 and omega_f the fast normal mode's frequency: short in t where the rods
@@ -382,13 +383,14 @@ def _gauss_slopes(pendulum: Pendulum, dt: Scalar, state: State) -> tuple[State, 
     Runge-Kutta methods, 2007). NaN where there is no solution, the step being too large.
     """
     # Momenta as the rates of rods of that inertia, so that all changes are angles.
-    inverse1 = dt / ((pendulum.m1 + pendulum.m2) * pendulum.l1**2)
-    inverse2 = dt / (pendulum.m2 * pendulum.l2**2)
+    length = jnp.abs(dt)  # steps may go backwards
+    inverse1 = length / ((pendulum.m1 + pendulum.m2) * pendulum.l1**2)
+    inverse2 = length / (pendulum.m2 * pendulum.l2**2)
 
     def size_of(old: State, new: State) -> Scalar:
         change = jax.tree.map(lambda a, b: jnp.abs(a - b), old, new)
         angles = jnp.maximum(change.theta1, change.theta2)
-        return jnp.abs(dt) * jnp.maximum(angles, jnp.maximum(change.p1 * inverse1, change.p2 * inverse2))
+        return length * jnp.maximum(angles, jnp.maximum(change.p1 * inverse1, change.p2 * inverse2))
 
     def again(r: _Round) -> _Round:
         slopes = _at_stages(pendulum, dt, state, r.slopes)
@@ -470,8 +472,8 @@ class Scheme:
         name: `rk4` (the classical method of order 4) or `rk8` (the 12-stage order-8 propagator of DOP853), both in
             (theta, p); `rk4-circle` and `rk8-circle`, the same without trigonometry; `rk8-circle-rescaled` and
             `rk10-circle-rescaled` (15 stages, order 10, by Stepanov), in rescaled time; `gauss` (Gauss-Legendre, three
-            stages, order 6) in (theta, p), symplectic, for motions over very many periods: one step costs as much as
-            four of `rk8`.
+            stages, order 6) in (theta, p), symplectic, for motions over very many periods: a step takes as long as two
+            of `rk8` written out.
         step: the step [s]. Even methods take n = ceil(t/step) steps of t/n each over a motion of length t; the
             rescaled one takes steps of at most `step`, near the bottom 1.9 `step`, much shorter where it flies.
         written_out: whether all stages of a step are written out, or run as a loop: slower to compile, faster for many

@@ -204,7 +204,7 @@ def test_gauss_is_symplectic_and_its_own_inverse(paper):
     assert defect("gauss", 0.04) < 1e-12
     assert defect("rk8", 0.04) > 1e-10
     there = dpend.flow(paper, STATE, 0.4, Scheme("gauss", 0.04))
-    back = dpend.flow(paper, there, -0.4, Scheme("gauss", 0.04))
+    back = dpend.flow(paper, there, -0.4, Scheme("gauss", 0.04))  # the momenta are iterated to the end backwards, too
     np.testing.assert_allclose(jax.tree.leaves(back), jax.tree.leaves(STATE), rtol=0, atol=1e-14)
 
 
