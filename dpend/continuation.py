@@ -99,7 +99,7 @@ class Problem:
             tables.append(np.asarray(table)[:count])
         return unpacked(np.concatenate(tables))
 
-    def followed(self, start: Walk, origin: Corrected | None, reach: "Reach") -> tuple[Corrected, str]:
+    def followed(self, start: Walk, origin: Corrected | None, reach: Reach) -> tuple[Corrected, str]:
         """The points after `start`, and what the family's end is; `origin` is the place it could come back to."""
         nothing = np.zeros((CHUNK, UNKNOWNS))
         tasks = Tasks(nothing, nothing, nothing[:, 0].astype(int), np.int64(0))
@@ -112,12 +112,13 @@ class Problem:
             end = ("", "ended", "lost")[int(status)]
             if end == "lost" and len(rows.point) and self._near_limit(rows):
                 end = "ended"
-            back = None if origin is None else self._back(origin, rows, count - int(more))
-            if back is not None:
-                return _cut(rows, back)
             (longer,) = np.nonzero(self.period(rows) > reach.period)
             if longer.size:
                 rows = some_of(rows, slice(longer[0] + 1))
+            back = None if origin is None else self._back(origin, rows, count - int(more))
+            if back is not None:
+                return _cut(rows, back)
+            if longer.size:
                 return self._ending_at(reach.period, begin, rows), "longest period"
         if count > reach.points:
             return some_of(rows, slice(reach.points)), "unfinished"
@@ -283,14 +284,11 @@ def _reflects(rows: Corrected, crossing: Any) -> bool:
         return False
     at = len(shorter.point) // 2  # far from the branch point, where all is close to all
     curve = _reduced(longer)
-    chords = np.diff(curve, axis=0)
     for sign in (1.0, -1.0):
         image = np.append(sign * shorter.end[at, :2], _reduced(shorter)[at, 2])
-        to = np.array([way_to(point, image) for point in curve[:-1]])
-        share = np.clip(np.sum(to * chords, axis=1) / np.sum(chords * chords, axis=1), 0.0, 1.0)
-        away = np.linalg.norm(to - share[:, None] * chords, axis=1)
+        away, lengths = away_from(curve[:-1], curve[1:], image)
         nearest = int(np.argmin(away))
-        if away[nearest] < _IMAGE * np.linalg.norm(chords[nearest]):
+        if away[nearest] < _IMAGE * lengths[nearest]:
             return True
     return False
 
@@ -307,10 +305,18 @@ def _reduced(rows: Corrected) -> np.ndarray:
 
 
 def way_to(where: np.ndarray, release: np.ndarray) -> np.ndarray:
-    """From one to the other, angles modulo 2 pi."""
+    """From one (theta1, theta2, log of the time) to the other, angles modulo 2 pi; shape (..., 3)."""
     way = release - where
-    way[:2] -= 2 * np.pi * np.round(way[:2] / (2 * np.pi))
+    way[..., :2] -= 2 * np.pi * np.round(way[..., :2] / (2 * np.pi))
     return way
+
+
+def away_from(start: np.ndarray, end: np.ndarray, release: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far a release is from the chords between points, and how long these are, shape (n,) both."""
+    chord, to = end - start, way_to(start, release)
+    length = np.maximum(np.linalg.norm(chord, axis=1), np.finfo(float).tiny)
+    share = np.clip(np.sum(to * chord, axis=1) / length**2, 0.0, 1.0)
+    return np.linalg.norm(to - share[:, None] * chord, axis=1), length
 
 
 def begun(point: np.ndarray, tangent: np.ndarray, step: Scalar, steps: Scalar) -> Walk:
