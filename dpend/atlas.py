@@ -19,10 +19,10 @@ import numpy as np
 
 from dpend._runtime import require_float64
 from dpend.families import known_pendulum
-from dpend.files import as_json, check_place, replacing
+from dpend.files import check_place, json_text, replacing
 from dpend.orbits import SYMMETRIES, PeriodicOrbit, find_orbit
 from dpend.pendulum import Pendulum, released
-from dpend.scan import Scan, Zero, scanned
+from dpend.scan import Scan, Zero, longest, scanned
 from dpend.shooting import natural
 from dpend.trajectory import Status, known_number
 
@@ -40,8 +40,10 @@ class Coverage:
         theta2_points: motions that were integrated by the last scan, or by those of all slices.
         time_points: rows in time at which each was looked at.
         refinements: how often the intervals of theta2 were doubled; of the whole square how often the slices were.
-        suspicious_cells: places that were left undecided: intervals of theta2 too narrow to halve; returns to rest that
-            Newton's method did not confirm; of the whole square also passages of families that no return answers to.
+        suspicious_cells: places where something may be missing: intervals of theta2 too narrow to halve; returns to
+            rest that Newton's method did not confirm; by how much `winding` and `degree` differ, slice by slice;
+            returns or families that the last refinements still changed; of the whole square also passages of families
+            that no return answers to, and returns that no passage does.
         winding, degree: how often p at the last time goes round zero as theta2 goes round, and the sum of the signs of
             all returns found, those of orbits run through several times included: unequal if one is missing. Of several
             slices their sums.
@@ -143,10 +145,9 @@ class Atlas:
     def _about(self) -> dict[str, Any]:
         import dpend
 
-        names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
         return {
             "dpend_version": dpend.__version__,
-            "pendulum": {key: float(getattr(self.pendulum, name)) for name, key in names.items()},
+            "pendulum": pendulum_record(self.pendulum),
             "max_period_s": self.max_period,
             "units": dict(_UNITS),
             "coverage": asdict(self.coverage),
@@ -156,12 +157,12 @@ class Atlas:
     def _json(self) -> str:
         """An orbit a line: files are read by people and compared by lines, too."""
         record = self.record()
-        lines = (" ".join(as_json(orbit).split()) for orbit in record.pop("orbits"))
-        return as_json(record).removesuffix("\n}") + ',\n  "orbits": [\n    ' + ",\n    ".join(lines) + "\n  ]\n}\n"
+        lines = (json_text(orbit, indent=None) for orbit in record.pop("orbits"))
+        return json_text(record).removesuffix("\n}") + ',\n  "orbits": [\n    ' + ",\n    ".join(lines) + "\n  ]\n}\n"
 
     def _csv(self) -> str:
         text = io.StringIO()
-        text.write("# " + " ".join(as_json(self._about()).split()) + "\n")
+        text.write("# " + json_text(self._about(), indent=None) + "\n")
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([_file_name(key) for key in self.table])
         columns = {key: _out(key, column).tolist() for key, column in self.table.items()}
@@ -232,6 +233,12 @@ _COLUMNS: dict[str, type] = {
     "iterations": int,
     "status": int,
 }
+
+
+def pendulum_record(pendulum: Pendulum) -> dict[str, float]:
+    """A pendulum as it stands in files."""
+    names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
+    return {key: float(getattr(pendulum, name)) for name, key in names.items()}
 
 
 def _file_name(column: str) -> str:
@@ -326,29 +333,40 @@ def find_brake_orbits(pendulum: Pendulum, *, theta1: Any, max_period: Any) -> At
     Returns:
         Atlas, in order of the period; theta2 in (-pi, pi].
     Raises:
-        ValueError: theta1 not finite, max_period not positive, g not positive, a traced argument.
+        ValueError: theta1 not finite; max_period not positive, or so long that the fast normal mode would swing 32
+            times; g not positive; a traced argument.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
     fixed = known_pendulum(pendulum)
     theta1 = known_number("theta1", theta1, unit="rad")
-    max_period = known_number("max_period", max_period, positive=True, unit="s")
+    max_period = known_period(fixed, max_period)
     counts: list[int] = []
     for refinement in range(_MOST_REFINEMENTS + 1):
         result = returns(fixed, theta1, max_period, _INTERVALS << refinement)
         counts.append(len(result.zeros))
-        if (len(counts) > 2 and counts[-3:] == counts[-1:] * 3) or result.exhausted:
+        unsettled = max(counts[-3:]) - min(counts[-3:])
+        if (len(counts) > 2 and not unsettled) or result.exhausted:
             break
     found, lost = _solved(fixed, theta1, max_period, result)
     coverage = Coverage(
         theta2_points=result.motions,
         time_points=result.rows,
         refinements=refinement,
-        suspicious_cells=len(result.open_cells) + lost,
+        suspicious_cells=len(result.open_cells) + lost + abs(result.winding - result.degree) + unsettled,
         winding=result.winding,
         degree=result.degree,
     )
     return Atlas(fixed, max_period, stacked([_row(orbit) for orbit in found]), (), coverage)
+
+
+def known_period(pendulum: Pendulum, max_period: Any) -> float:
+    """`max_period`, refused where no scan reaches."""
+    value = known_number("max_period", max_period, positive=True, unit="s")
+    most = 2 * longest(jax.tree.map(float, natural(pendulum))) * math.sqrt(pendulum.l1 / pendulum.g)
+    if value > most:
+        raise ValueError(f"max_period must be at most {most:.4g} s for this pendulum, got {value:g}: ask for less")
+    return value
 
 
 def returns(pendulum: Pendulum, theta1: float, max_period: float, intervals: int) -> Scan:

@@ -20,7 +20,8 @@ import numpy as np
 import typer
 
 import dpend
-from dpend.files import as_json, check_place, replacing
+from dpend.atlas import pendulum_record
+from dpend.files import check_place, json_text, replacing
 from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
 from dpend.steppers import METHODS
@@ -187,7 +188,9 @@ def atlas(
         _print_json(found.record())
     else:
         _print_atlas(found, theta1, out)
-    return 0 if np.all(found.table["status"] == Status.CONVERGED) else 1
+    families = all(family["status"] == Status.CONVERGED.name.lower() for family in found.families)
+    solved = families and np.all(found.table["status"] == Status.CONVERGED)
+    return 0 if solved and not found.coverage.suspicious_cells else 1
 
 
 @app.command()
@@ -434,7 +437,7 @@ def _orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
         "dual": {"theta1_deg": _degrees(orbit.dual.theta1), "theta2_deg": _degrees(orbit.dual.theta2)},
         "turns": [int(turn) for turn in orbit.turns],
         "error_estimate": {"theta2_deg": _degrees(angle_error), "period_s": float(period_error)},
-        "pendulum": _pendulum_record(orbit.pendulum),
+        "pendulum": pendulum_record(orbit.pendulum),
     }
 
 
@@ -470,13 +473,8 @@ def _family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
         "ends": list(family.ends),
         "status": status.name.lower(),
         "message": family.message,
-        "pendulum": _pendulum_record(Pendulum(*(leaf[0] for leaf in jax.tree.leaves(orbits.pendulum)))),
+        "pendulum": pendulum_record(Pendulum(*(leaf[0] for leaf in jax.tree.leaves(orbits.pendulum)))),
     }
-
-
-def _pendulum_record(pendulum: Pendulum) -> dict[str, float]:
-    names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
-    return {key: float(getattr(pendulum, name)) for name, key in names.items()}
 
 
 def _motion_record(motion: Trajectory) -> dict[str, Any]:
@@ -505,7 +503,7 @@ def _degrees(radians: Any) -> float:
 
 
 def _print_json(record: dict[str, Any]) -> None:
-    print(as_json(record))
+    print(json_text(record))
 
 
 def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
@@ -672,7 +670,7 @@ def _write_family_csv(record: dict[str, Any], path: Path) -> None:
 
 
 def _write_json(record: dict[str, Any], path: Path) -> None:
-    path.write_text(as_json(record) + "\n")
+    path.write_text(json_text(record) + "\n")
 
 
 def _write_netcdf(motion: Trajectory, path: Path) -> None:

@@ -54,8 +54,8 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
-def as_json(record: dict[str, Any]) -> str:
-    """The text of a JSON object; NaN and infinity become null."""
+def json_text(record: dict[str, Any], indent: int | None = 2) -> str:
+    """The text of a JSON object, on one line without `indent`; NaN and infinity become null."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, dict):
@@ -64,4 +64,4 @@ def as_json(record: dict[str, Any]) -> str:
             return [clean(item) for item in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    return json.dumps(clean(record), indent=2, allow_nan=False)
+    return json.dumps(clean(record), indent=indent, allow_nan=False)

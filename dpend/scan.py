@@ -40,10 +40,10 @@ _WINDOW = 64
 # The first guess of the time between rows: the fast mode advances by this [rad].
 _ROW = 0.05
 # Where a cell that may hold a zero has an error along time above this share of its height, all rows are laid denser,
-# so many times at most.
-_COARSE, _DENSER = 0.02, 6
-# Intervals of theta2 looked at together: as many as fit a cache.
-_BATCH = 512
+# so many at most; and what can be scanned at all: motions so long are known to no digit.
+_COARSE, _MOST_ROWS, _LONGEST = 0.02, 8192, 2048
+# Cells looked at together: as many as fit a cache.
+_BATCH = 512 * 320
 # So many motions are integrated at most: what is undecided then stays so.
 _MOST_MOTIONS = 200_000
 # Intervals [rad] narrower than this are not halved: rounding, magnified as the tangent is, would be all there is.
@@ -123,17 +123,21 @@ def scanned(pendulum: Pendulum, theta1: float, duration: float, intervals: int) 
     """All returns to rest up to `duration`, from so many intervals of theta2 to begin with.
 
     Arguments:
-        pendulum: in natural units, its fields numbers; so is the duration.
+        pendulum: in natural units, its fields numbers; so is the duration, at most `longest`.
         theta1: [rad].
     """
-    spacing = _ROW / float(fast_frequency(pendulum))
-    for _ in range(_DENSER):
-        rows = _WINDOW * math.ceil(duration / spacing / _WINDOW)
+    rows = _WINDOW * math.ceil(duration * float(fast_frequency(pendulum)) / _ROW / _WINDOW)
+    while 2 * rows <= _MOST_ROWS:
         try:
             return _Scanner(pendulum, theta1, duration / rows, rows, coarse=False).run(intervals)
         except _TooCoarse:
-            spacing = 0.5 * duration / rows
+            rows *= 2
     return _Scanner(pendulum, theta1, duration / rows, rows, coarse=True).run(intervals)
+
+
+def longest(pendulum: Pendulum) -> float:
+    """The longest duration that can be scanned: the fast mode advances by 100 radians."""
+    return _LONGEST * _ROW / float(fast_frequency(pendulum))
 
 
 @dataclass(frozen=True)
@@ -148,12 +152,13 @@ class _Scanner:
 
     def run(self, intervals: int) -> Scan:
         edges = np.linspace(-np.pi, np.pi, intervals + 1)
+        batch = max(_BATCH // self.rows, 16)
         zeros: list[Zero] = []
         open_cells: list[tuple[float, float]] = []
         motions, turned = 0, 0.0
-        waiting: list[Any] = [edges[i : i + _BATCH + 1] for i in range(0, intervals, _BATCH)][::-1]
+        waiting: list[Any] = [edges[i : i + batch + 1] for i in range(0, intervals, batch)][::-1]
         while waiting:
-            some = self._taken(waiting)
+            some = self._taken(waiting, batch)
             if isinstance(some, np.ndarray):  # edges whose motions are not known yet
                 known = self.motions(some)
                 motions += len(some)
@@ -164,7 +169,7 @@ class _Scanner:
                 wide &= np.all(np.isfinite(half.error), axis=0)
                 zeros += found
                 again = half.intervals.some(np.flatnonzero(undecided & wide))
-                waiting += [again.some(slice(i, i + _BATCH)) for i in range(0, len(again.left), _BATCH)]
+                waiting += [again.some(slice(i, i + batch)) for i in range(0, len(again.left), batch)]
                 left = half.intervals.some(np.flatnonzero(undecided & ~wide))
                 open_cells += zip(left.left.tolist(), (left.right - left.left).tolist(), strict=True)
                 settled = half.intervals.some(np.flatnonzero(~(undecided & wide)))
@@ -173,12 +178,12 @@ class _Scanner:
         winding = round(turned / (2 * np.pi)) if math.isfinite(turned) else 0
         return Scan(_distinct(zeros, self.dt), motions, self.rows + 1, tuple(open_cells), winding)
 
-    def _taken(self, waiting: list[Any]) -> Any:
+    def _taken(self, waiting: list[Any], batch: int) -> Any:
         """The next edges, or as many intervals as fit a batch."""
         if isinstance(waiting[-1], np.ndarray):
             return waiting.pop()
         parts = [waiting.pop()]
-        while waiting and isinstance(waiting[-1], _Intervals) and sum(len(p.left) for p in parts) < _BATCH // 2:
+        while waiting and isinstance(waiting[-1], _Intervals) and sum(len(p.left) for p in parts) < batch // 2:
             parts.append(waiting.pop())
         return _Intervals(*(np.concatenate(columns, axis=-1) for columns in zip(*parts, strict=True)))
 

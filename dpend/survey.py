@@ -19,16 +19,17 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.atlas import Atlas, Coverage, is_return, returns, stacked, table_of
+from dpend.atlas import Atlas, Coverage, is_return, known_period, returns, stacked, table_of
+from dpend.continuation import away_from, way_to
 from dpend.families import Family, follow_family, known_pendulum
-from dpend.files import as_json, check_place, replacing
-from dpend.orbits import find_orbit
+from dpend.files import check_place, json_text, replacing
+from dpend.orbits import PeriodicOrbit, find_orbit
 from dpend.pendulum import Pendulum
 from dpend.scan import Zero
-from dpend.trajectory import Status, known_number
+from dpend.trajectory import Status
 
 # Doublings of the slices: this many to begin with, and at most so many. Slices are odd multiples of pi/2^(level + 1).
-_FIRST_LEVELS, _MOST_LEVELS = 5, 10
+_FIRST_LEVELS, _MOST_LEVELS, _LEVELS_WITHOUT_NEWS = 5, 10, 2
 # Intervals of theta2 that a slice's scan begins with; more where it leaves a doubt.
 _INTERVALS, _MORE_INTERVALS = 128, 1024
 # Points along families lie no further apart than this [arclength], so that chords between them are true to the second
@@ -64,12 +65,13 @@ def find_brake_families(
         where it goes on beyond max_period), `shortest_period_s` on it (the limit where it shrinks onto a normal mode)
         and `longest_period_s`, `special_points` with kind, arclength, release in degrees, period and kappa.
     Raises:
-        ValueError: max_period not positive, g not positive, a traced argument; a store made with other settings.
+        ValueError: max_period not positive, or so long that the fast normal mode would swing 32 times; g not positive;
+            a traced argument; a store made with other settings.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
     fixed = known_pendulum(pendulum)
-    max_period = known_number("max_period", max_period, positive=True, unit="s")
+    max_period = known_period(fixed, max_period)
     survey = _Survey(fixed, max_period)
     if store is not None:
         survey = _resumed(survey, Path(store))
@@ -84,7 +86,7 @@ def find_brake_families(
             if progress is not None:
                 progress(len(survey.slices), planned, len(survey.tracks))
         newest = max((track.level for track in survey.tracks), default=0)
-        if level + 1 >= _FIRST_LEVELS and level - newest >= 2:
+        if level + 1 >= _FIRST_LEVELS and level - newest >= _LEVELS_WITHOUT_NEWS:
             break
     return survey.atlas(level)
 
@@ -128,14 +130,8 @@ class _Track:
 
     def holds(self, release: np.ndarray) -> bool:
         """Whether a point (theta1, theta2, log of the period) lies as near to a chord as the curve may be."""
-        start, end = self.chords[:, 0], self.chords[:, 1]
-        to = release - start
-        to[:, :2] -= 2 * np.pi * np.round(to[:, :2] / (2 * np.pi))
-        way = end - start
-        length = np.maximum(np.linalg.norm(way, axis=1), 1e-300)
-        share = np.clip(np.sum(to * way, axis=1) / length**2, 0.0, 1.0)
-        away = np.linalg.norm(to - share[:, None] * way, axis=1)
-        return bool(np.any(away < np.maximum(_NEAR, _BENT * length)))
+        away, lengths = away_from(self.chords[:, 0], self.chords[:, 1], release)
+        return bool(np.any(away < np.maximum(_NEAR, _BENT * lengths)))
 
     def is_same(self, other: "_Track") -> bool:
         """Whether two were followed along one family: most of the other's orbits lie on this one's curves."""
@@ -158,10 +154,8 @@ class _Track:
 
 def _bridge(point: np.ndarray, images: np.ndarray) -> np.ndarray:
     """The chord from a curve's end to the nearest of some images of it, shape (1, 2, 3)."""
-    way = images[:, :2] - point[:2]
-    way -= 2 * np.pi * np.round(way / (2 * np.pi))
-    nearer = way[np.argmin(np.linalg.norm(way, axis=1))]
-    return np.stack([point, point + np.append(nearer, 0.0)])[None]
+    way = way_to(point, images) * [1, 1, 0]
+    return np.stack([point, point + way[np.argmin(np.linalg.norm(way, axis=1))]])[None]
 
 
 # --- the search -------------------------------------------------------------------------------------------------------
@@ -178,6 +172,10 @@ class _Slice:
     degree: int
     returns: list[list[float]]
     lost: int = 0
+
+    @property
+    def doubts(self) -> int:
+        return self.open_cells + self.lost + abs(self.winding - self.degree)
 
 
 @dataclass
@@ -219,7 +217,7 @@ class _Survey:
         orbit = find_orbit(self.pendulum, theta1, guess=seed[1:])
         if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
             return False
-        new = self._track(seed, level)
+        new = self.track(orbit, seed, level)
         for i, track in enumerate(self.tracks):
             if track.is_same(new):
                 # Met where its chords were not near enough; the one that was followed further stays.
@@ -229,8 +227,7 @@ class _Survey:
         self.tracks.append(new)
         return self._known(*seed)
 
-    def _track(self, seed: tuple[float, float, float], level: int) -> _Track:
-        orbit = find_orbit(self.pendulum, seed[0], guess=seed[1:])
+    def track(self, orbit: PeriodicOrbit, seed: tuple[float, float, float], level: int) -> _Track:
         longest = max(self.max_period, float(orbit.period))
         family = follow_family(self.pendulum, orbit, longest_step=_STEP, longest_period=longest)
         return _Track.of(family, seed, level)
@@ -270,11 +267,12 @@ class _Survey:
             tables.append(table | {"family": np.full(len(table["period"]), name)})
             records.append({"family": name} | record)
         every = self.slices.values()
+        unsettled = sum(level - track.level < _LEVELS_WITHOUT_NEWS for track in self.tracks)
         coverage = Coverage(
             theta2_points=sum(one.motions for one in every),
             time_points=max(one.rows for one in every),
             refinements=level,
-            suspicious_cells=sum(one.open_cells + one.lost for one in every) + len(self.unmatched()),
+            suspicious_cells=sum(one.doubts for one in every) + len(self.unmatched()) + unsettled,
             winding=sum(one.winding for one in every),
             degree=sum(one.degree for one in every),
             slices=len(self.slices),
@@ -284,9 +282,8 @@ class _Survey:
 
 def _apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Distances between all pairs (theta2, period) [rad, and log of the period]."""
-    angles = one[:, None, 0] - other[None, :, 0]
-    angles -= 2 * np.pi * np.round(angles / (2 * np.pi))
-    return np.asarray(np.hypot(angles, np.log(one[:, None, 1] / other[None, :, 1])))
+    one, other = (np.column_stack([0 * each[:, 0], each[:, 0], np.log(each[:, 1])]) for each in (one, other))
+    return np.asarray(np.linalg.norm(way_to(one[:, None], other), axis=-1))
 
 
 def _left_over(returns: np.ndarray, passages: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -359,11 +356,11 @@ def _entry(family: Family, max_period: float) -> _Entry:
     least = int(np.argmin(table["period"]))
     sign = -1 if math.remainder(table["theta1"][least], 2 * math.pi) < 0 else 1
     turns = np.round(sign * table["theta1"][least] / (2 * np.pi)), np.round(sign * table["theta2"][least] / (2 * np.pi))
-    for number_, shift in zip((1, 2), turns, strict=True):
-        for key in (f"theta{number_}", f"dual_theta{number_}"):
+    for rod, shift in zip(("1", "2"), turns, strict=True):
+        for key in (f"theta{rod}", f"dual_theta{rod}"):
             table[key] = sign * table[key] - 2 * np.pi * shift
         centred = family.symmetry == "centred"
-        table[f"turns{number_}"] = sign * table[f"turns{number_}"] - (2 * int(shift) if centred else 0)
+        table[f"turns{rod}"] = sign * table[f"turns{rod}"] - (2 * int(shift) if centred else 0)
     inside = table["period"] <= max_period * (1 + 1e-12)
     kept = {key: column[inside] for key, column in table.items()}
     ends = list(family.ends[::-1] if back else family.ends)
@@ -413,7 +410,7 @@ def _keep(survey: _Survey, path: Path) -> None:
         "families": [{"seed": list(track.seed), "level": track.level} for track in survey.tracks],
     }
     with replacing(path) as draft:
-        draft.write_text(as_json(record) + "\n")
+        draft.write_text(json_text(record) + "\n")
 
 
 def _resumed(survey: _Survey, path: Path) -> _Survey:
@@ -435,6 +432,7 @@ def _resumed(survey: _Survey, path: Path) -> _Survey:
             "give another name"
         )
     for family in families:
-        survey.tracks.append(survey._track(tuple(family["seed"]), family["level"]))
+        seed = tuple(family["seed"])
+        survey.tracks.append(survey.track(find_orbit(survey.pendulum, seed[0], guess=seed[1:]), seed, family["level"]))
     survey.slices |= {one.pop("theta1"): _Slice(**one) for one in slices}
     return survey

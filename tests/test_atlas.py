@@ -141,6 +141,7 @@ def test_an_atlas_without_orbits(paper, tmp_path):
         ({"theta1": np.nan}, "theta1 must be a finite number"),
         ({"max_period": 0.0}, "max_period must be"),
         ({"max_period": np.inf}, "max_period must be"),
+        ({"max_period": 16.0}, "max_period must be at most 15.83 s"),
         ({"pendulum": Pendulum(g=0.0)}, "g must be positive"),
     ],
 )

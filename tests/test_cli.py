@@ -1,5 +1,6 @@
 """The command line: exactly one JSON object, one line for bad input, and files that are whole."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -9,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import dpend
+import dpend.atlas
+import dpend.scan
 from dpend import cli
 
 
@@ -324,6 +326,7 @@ def test_the_atlas_of_an_angle(capsys, tmp_path):
     for bad in (
         ("--theta1", "nan", "--max-period", 1),
         ("--theta1", 40, "--max-period", 0),
+        ("--theta1", 40, "--max-period", 1e9),
         ("--theta1", 40),
         ("--theta1", 40, "--max-period", 1, "--out", "f.txt"),
         ("--theta1", 40, "--max-period", 1, "--store", "s.json"),
@@ -332,6 +335,16 @@ def test_the_atlas_of_an_angle(capsys, tmp_path):
     ):
         status, text, err = run(capsys, "atlas", *bad)
         assert (status, text, err.count("\n")) == (2, "", 1)
+
+
+def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
+    def forgetful(*arguments):
+        result = dpend.scan.scanned(*arguments)
+        return dataclasses.replace(result, zeros=result.zeros[1:])
+
+    monkeypatch.setattr(dpend.atlas, "scanned", forgetful)
+    status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
+    assert (status, len(found["orbits"]), found["coverage"]["suspicious_cells"]) == (1, 4, 1)
 
 
 @pytest.mark.slow
