@@ -355,6 +355,11 @@ GAUSS = Tableau(
     b=(5 / 18, 4 / 9, 5 / 18),
     order=6,
 )
+# a_ij/b_j. The method is symplectic where b_i a_ij + b_j a_ji = b_i b_j, that is where the shares of ij and of ji add
+# up to 1, and symmetric in time where those of ij and of (4 - i)(4 - j) do. These doubles do both to the last bit; a_ij
+# themselves are off by 1e-17, and so would the energy be, in one direction, period by period.
+_NEAR, _FAR = 0.5 + 0.15 * _ROOT15, 0.5 + 0.12 * _ROOT15
+_SHARES = ((0.5, 1.0 - _NEAR, 1.0 - _FAR), (_NEAR, 0.5, 1.0 - _NEAR), (_FAR, _NEAR, 0.5))
 # An iteration that has come this near [rad] and gets no nearer has met rounding; one that has not in so many rounds
 # finds no solution.
 _NEARLY, _MOST_ROUNDS = 1e-9, 100
@@ -408,8 +413,8 @@ def _gauss_slopes(pendulum: Pendulum, dt: Scalar, state: State) -> tuple[State, 
 
 
 def _at_stages(pendulum: Pendulum, dt: Scalar, state: State, slopes: tuple[State, ...]) -> tuple[State, ...]:
-    steps = [jax.tree.map(lambda slope: dt * slope, slope) for slope in slopes]
-    return tuple(vector_field(pendulum, _displaced(state, row, steps)) for row in GAUSS.a)
+    steps = [jax.tree.map(partial(jnp.multiply, dt * b), slope) for b, slope in zip(GAUSS.b, slopes, strict=True)]
+    return tuple(vector_field(pendulum, _displaced(state, row, steps)) for row in _SHARES)
 
 
 # Leaves alone: JAX describes trees under custom rules with text in the place of their leaves, which `State` refuses.
@@ -437,7 +442,8 @@ def _gauss_step(constants: tuple[Pendulum, Scalar], point: _Summed) -> _Summed:
     pendulum, dt = constants
     leaves = _gauss_leaves(jax.tree.leaves(pendulum), dt, jax.tree.leaves(point.state))
     slopes = [State(*leaves[i : i + 4]) for i in (0, 4, 8)]
-    change = _displaced(point.rest, GAUSS.b, [jax.tree.map(lambda slope: dt * slope, slope) for slope in slopes])
+    steps = [jax.tree.map(partial(jnp.multiply, dt * b), slope) for b, slope in zip(GAUSS.b, slopes, strict=True)]
+    change = _displaced(point.rest, (1.0,) * 3, steps)
     state = jax.tree.map(jnp.add, point.state, change)
     rest = jax.tree.map(lambda old, new, change: (old - new) + change, point.state, state, change)
     return _Summed(state, rest)
