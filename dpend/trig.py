@@ -91,3 +91,26 @@ def _sincos_jvp(primals, tangents):  # type: ignore[no-untyped-def]
     (x,), (dx,) = primals, tangents
     sine, cosine = _sincos(x)
     return (sine, cosine), (cosine * dx, -sine * dx)
+
+
+# Angles within this many radians stay as they are: their last place is finer than what a motion rounds anyway.
+_FAR = 100.0
+
+
+def unwound(angle: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], tuple[Array, Array]]:
+    """An angle without its full turns if it is far from zero, and the turns [rad] as two numbers for `wound`.
+
+    The digits of what is left are all there are: sums of small steps round as sums of small numbers do.
+    """
+    turns = lax.round(angle * (0.25 * _TWO_OVER_PI), lax.RoundingMethod.TO_NEAREST_EVEN)
+    size = lax.stop_gradient(jnp.abs(angle))
+    quarters = jnp.where((size > _FAR) & (size <= LARGEST_ANGLE), lax.stop_gradient(4.0 * turns), 0.0)
+    high, middle, low = (quarters * piece for piece in _PI_2)
+    rest = middle + low
+    return (angle - high) - rest, (high, rest)
+
+
+def wound(angle: Float[Array, "*shape"], turns: tuple[Array, Array]) -> Float[Array, "*shape"]:
+    """The angle with its turns again, rounded once."""
+    high, rest = turns
+    return (angle + rest) + high
