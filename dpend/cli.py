@@ -200,7 +200,10 @@ def simulate(
     duration: Annotated[float, _numeric(help="How long [s]; negative runs backwards.")],
     p1: Annotated[float, _numeric("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")] = 0.0,
     p2: Annotated[float, _numeric("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")] = 0.0,
-    method: Annotated[str, typer.Option(help="rk4, rk8, gauss, rk4-circle or rk8-circle.")] = "rk8",
+    method: Annotated[
+        str | None,
+        typer.Option(help="rk4, rk8 (default for a step), gauss, rk4-circle or rk8-circle (for a tolerance)."),
+    ] = None,
     step: Annotated[float | None, _numeric(help="Largest step [s].")] = None,
     tolerance: Annotated[
         float | None, _numeric(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
