@@ -16,7 +16,7 @@ Both step back where an orbit is not to be had, and say so if that is where they
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -66,7 +66,7 @@ class Design:
         sensitivities: derivatives with respect to the logarithm of each of l1, l2, m1, m2, g and theta1, free or not:
             `sensitivities["loss"]["l1"]` is d loss/d ln l1; beside `loss` there are `theta2` [rad], `period` [s] and
             `kappa`, of one orbit scalars, of several one a branch.
-        iterations: steps taken.
+        iterations: steps taken, of all searches that were begun.
         looks: how often the orbits were solved for.
         status: a value of `Status`.
         at_bounds: the parameters that ended at one of their bounds.
@@ -133,6 +133,7 @@ class _Problem:
     angles: tuple[float, ...]
     low: np.ndarray  # bounds of x, both zero where it is not free
     high: np.ndarray
+    equation: int | None = None  # the only one that is asked, if not all
     looks: int = 0
 
     @property
@@ -151,6 +152,8 @@ class _Problem:
         lost = [int(orbit.status) for orbit in orbits if int(orbit.status) != Status.CONVERGED]
         rates = tuple(slopes(orbit) for orbit in orbits)
         value, jacobian = (np.asarray(part) for part in _judged(self.loss, orbits, rates))
+        if self.equation is not None:
+            value, jacobian = value[[self.equation]], jacobian[[self.equation]]
         finite = np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))
         status = lost[0] if lost else int(Status.CONVERGED if finite else Status.NONFINITE)
         return _Look(x, value, jacobian, orbits, rates, status)
@@ -288,28 +291,47 @@ def _nearest_of_one(problem: _Problem, look: _Look, most: int) -> tuple[_Look, i
         if changes:
             nearest, more, how = min(changes, key=lambda change: abs(float(change[0].x[i])))
             return nearest, steps + more, how
-    return (found if status == Status.CONVERGED else best), steps, status
+    if status == Status.CONVERGED:
+        return found, steps, status
+    closest, more, how = _least(problem, best, most, _square)
+    return closest, steps + more, _without_solution(how)
+
+
+def _without_solution(how: int) -> int:
+    """The status of equations of which the least sum of squares has been sought, which ended with `how`."""
+    return int(Status.NO_SOLUTION) if how == Status.CONVERGED else how
 
 
 def _nearest_of_many(problem: _Problem, look: _Look, most: int) -> tuple[_Look, int, int]:
-    """The nearest solution near the start; where Newton's method finds none and there is but one equation, from the
-    nearest of those that one parameter alone makes.
+    """The nearest solution near the start; where Newton's method finds none, the nearest of those that it finds from
+    the least sum of squares, and from where one parameter alone makes one of the equations true.
     """
     found, steps, status = _nearest(problem, look, most)
-    if status == Status.CONVERGED or look.value.size > 1:
+    if status == Status.CONVERGED:
         return found, steps, status
-    begin: _Look | None = None
-    for i in problem.free:
+    closest, more, how = _least(problem, found, most, _square)
+    steps += more
+    solutions = []
+    for begin in (closest, *_beginnings(problem, look, most)):
+        found, more, status = _nearest(problem, begin, most)
+        steps += more
+        if status == Status.CONVERGED:
+            solutions.append(found)
+    if not solutions:
+        return closest, steps, _without_solution(how)
+    return min(solutions, key=lambda one: float(np.linalg.norm(one.x))), steps, int(Status.CONVERGED)
+
+
+def _beginnings(problem: _Problem, look: _Look, most: int) -> Iterator[_Look]:
+    """Looks where one parameter alone makes one of the equations true, the others being as at the start."""
+    for i, equation in itertools.product(problem.free, range(look.value.size)):
         only = np.arange(len(PARAMETERS)) == i
-        alone = replace(problem, low=problem.low * only, high=problem.high * only, looks=0)
-        one, more, how = _nearest_of_one(alone, look, most)
-        problem.looks, steps = problem.looks + alone.looks, steps + more
-        if how == Status.CONVERGED and (begin is None or np.linalg.norm(one.x) < np.linalg.norm(begin.x)):
-            begin = one
-    if begin is None:
-        return found, steps, status
-    found, more, how = _nearest(problem, begin, most)
-    return found, steps + more, how
+        alone = replace(problem, low=problem.low * only, high=problem.high * only, equation=equation, looks=0)
+        start = look._replace(value=look.value[[equation]], jacobian=look.jacobian[[equation]])
+        one, _, status = _nearest_of_one(alone, start, most)
+        problem.looks += alone.looks
+        if status == Status.CONVERGED:
+            yield problem.at(one.x)
 
 
 def _bracketed(problem: _Problem, one: _Look, other: _Look, most: int) -> tuple[_Look, int, int]:
@@ -504,6 +526,8 @@ def design_pendulum(
     See also: Nocedal and Wright, Numerical Optimization (2006), chapter 18: sequential quadratic programming.
     """
     require_float64()
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, theta1))):
+        raise ValueError("pendulum and theta1 must be numbers, not traced by jit or a derivative: design outside of it")
     start = known_pendulum(pendulum)
     branches, angles = _orbits_asked(branch, theta1)
     names = _names(free)
@@ -532,11 +556,7 @@ def design_pendulum(
     if goal == "minimum":
         return _result(problem, *_least(problem, first, max_iterations, _itself))
     solve = _nearest_of_one if len(names) == 1 else _nearest_of_many
-    found, steps, status = solve(problem, first, max_iterations)
-    if status == Status.NO_SOLUTION:
-        found, more, how = _least(problem, found, max_iterations, _square)
-        steps, status = steps + more, status if how == Status.CONVERGED else how
-    return _result(problem, found, steps, status)
+    return _result(problem, *solve(problem, first, max_iterations))
 
 
 def _orbits_asked(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
