@@ -18,7 +18,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -278,7 +278,7 @@ def _nearest_of_one(problem: _Problem, look: _Look, most: int) -> tuple[_Look, i
         changes = []
         for side in tuple(last):
             place = side * share * reach
-            trial = problem.at(_with(look.x, problem.free, np.clip(place, problem.low[i], problem.high[i])))
+            trial = problem.at(_with(look.x, problem.free, np.clip([place], problem.low[i], problem.high[i])))
             if not trial.sound:
                 del last[side]
                 continue
@@ -430,24 +430,21 @@ def _least(problem: _Problem, look: _Look, most: int, of: Callable[[_Look], _Sca
     A parameter at a bound that the gradient pushes it against is held; whenever others are held than before, L-BFGS
     begins anew.
     """
-    import optax
-
-    method = optax.scale_by_lbfgs(memory_size=len(PARAMETERS))
-    update = jax.jit(method.update)
-    state, held, fresh = method.init(jnp.asarray(look.x)), None, True
+    begin, update = _lbfgs()
+    state, held, fresh = begin(look.x), None, True
     for count in range(most):
         value, gradient = of(look)
         outwards = ((look.x <= problem.low) & (gradient > 0)) | ((look.x >= problem.high) & (gradient < 0))
         now = outwards | (problem.low == problem.high)
         if held is None or np.any(now != held):
-            state, held, fresh = method.init(jnp.asarray(look.x)), now, True
+            state, held, fresh = begin(look.x), now, True
         gradient = np.where(held, 0.0, gradient)
         if np.max(np.abs(gradient)) <= 1e-12 * abs(value):
             return look, count, int(Status.CONVERGED)
-        direction, state = update(jnp.asarray(gradient), state, jnp.asarray(look.x))
+        direction, state = update(gradient, state, look.x)
         direction = np.where(held, 0.0, -np.asarray(direction))
         if not gradient @ direction < 0:
-            state, fresh = method.init(jnp.asarray(look.x)), True
+            state, fresh = begin(look.x), True
             direction = -gradient / max(1.0, float(np.max(np.abs(gradient))))
         if not fresh and np.max(np.abs(direction)) <= _SMALL_STEP_DOWN:
             return look, count, int(Status.CONVERGED)
@@ -457,6 +454,21 @@ def _least(problem: _Problem, look: _Look, most: int, of: Callable[[_Look], _Sca
             return look, count, int(Status.CONVERGED) if rounding else after.status
         look, fresh = after, False
     return look, most, int(Status.MAX_ITERATIONS)
+
+
+@cache
+def _lbfgs() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The beginning and the direction of optax's L-BFGS, compiled once."""
+    import optax
+
+    method = optax.scale_by_lbfgs(memory_size=len(PARAMETERS))
+    begin, update = jax.jit(method.init), jax.jit(method.update)
+
+    def freely(function: Callable[..., Any], *arguments: Any) -> Any:
+        with jax.numpy_dtype_promotion("standard"):  # it counts in integers of two kinds
+            return function(*arguments)
+
+    return partial(freely, begin), partial(freely, update)
 
 
 def _lower(
@@ -528,6 +540,8 @@ def design_pendulum(
     require_float64()
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, theta1))):
         raise ValueError("pendulum and theta1 must be numbers, not traced by jit or a derivative: design outside of it")
+    if not isinstance(pendulum, Pendulum):
+        raise ValueError(f"pendulum must be a Pendulum, got {type(pendulum).__name__}")
     start = known_pendulum(pendulum)
     branches, angles = _orbits_asked(branch, theta1)
     names = _names(free)
