@@ -47,7 +47,9 @@ _LONGEST, _LOCAL = 0.5, 1e-5
 _SMALL, _SMALL_STEP_DOWN = 1e-9, 1e-8
 # An iteration that stalls at steps as short as this was stopped by rounding.
 _STALLED = 1e-6
-_LEAST_DAMPING = 2.0**-20
+_LEAST_DAMPING = 2.0**-12
+# Equations that are down to this share of where they began have a solution there.
+_SOLVED = 1e-8
 # Places at which one equation for one unknown is looked at on either side of the start for a change of sign.
 _PIECES = 16
 
@@ -96,7 +98,8 @@ class Design:
 
 _MESSAGES = {
     Status.CONVERGED: "Found.",
-    Status.MAX_ITERATIONS: "The search did not converge in the allowed iterations: start from the pendulum it came to.",
+    Status.MAX_ITERATIONS: "The search did not converge in the allowed iterations, or stalled: start from the pendulum "
+    "it came to.",
     Status.LEFT_BRANCH: "The search was stopped where the branch cannot be followed to this release: change the start, "
     "or the bounds.",
     Status.NO_SUCH_ORBIT: "The search was stopped where the branch ends without reaching this release: change the "
@@ -311,14 +314,15 @@ def _nearest_of_many(problem: _Problem, look: _Look, most: int) -> tuple[_Look, 
         return found, steps, status
     closest, more, how = _least(problem, found, most, _square)
     steps += more
+    solved = bool(np.max(np.abs(closest.value)) <= _SOLVED * np.max(np.abs(look.value)))
     solutions = []
-    for begin in (closest, *_beginnings(problem, look, most)):
+    for begin in (closest,) if solved else (closest, *_beginnings(problem, look, most)):
         found, more, status = _nearest(problem, begin, most)
         steps += more
         if status == Status.CONVERGED:
             solutions.append(found)
     if not solutions:
-        return closest, steps, _without_solution(how)
+        return closest, steps, int(Status.MAX_ITERATIONS) if solved else _without_solution(how)
     return min(solutions, key=lambda one: float(np.linalg.norm(one.x))), steps, int(Status.CONVERGED)
 
 
@@ -365,8 +369,8 @@ def _with(x: np.ndarray, free: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _searched(problem: _Problem, look: _Look, step: np.ndarray, weight: float) -> _Look:
     """The look after as much of the step as lowers |x|^2/2 + weight |loss|; one with a failed status if none does.
 
-    Where the whole step does not, the curvature of the equations is made good before it is halved: a merit as this one
-    would otherwise refuse Newton's steps along a curved solution (Maratos).
+    Where a step does not, the curvature of the equations is made good before it is halved: a merit as this one would
+    otherwise refuse Newton's steps along a curved solution (Maratos).
     """
     free = problem.free
     x, jacobian = look.x[free], look.jacobian[:, free]
@@ -384,10 +388,10 @@ def _searched(problem: _Problem, look: _Look, step: np.ndarray, weight: float) -
             return trial
         if trial.sound and merit(trial) <= merit(look) + 1e-4 * damping * rate:
             return trial
-        if trial.sound and damping == 1.0:
-            back = np.linalg.lstsq(jacobian, -trial.value, rcond=None)[0]
+        if trial.sound:
+            back = np.linalg.lstsq(jacobian, (1 - damping) * look.value - trial.value, rcond=None)[0]
             bent = problem.at(_with(look.x, free, np.clip(trial.x[free] + back, low, high)))
-            if bent.sound and merit(bent) <= merit(look) + 1e-4 * rate:
+            if bent.sound and merit(bent) <= merit(look) + 1e-4 * damping * rate:
                 return bent
         failure = int(Status.NO_SOLUTION) if trial.sound else trial.status
         damping /= 2
