@@ -29,7 +29,7 @@ from dpend._runtime import require_float64
 from dpend.families import known_pendulum
 from dpend.orbits import BRANCHES, PeriodicOrbit, find_orbit, slopes
 from dpend.pendulum import Pendulum, Scalar, hamiltonian, released
-from dpend.trajectory import Status, known_number
+from dpend.trajectory import Status, known_number, message
 
 Loss = Callable[..., Any]
 GOALS = ("zero", "minimum")
@@ -93,7 +93,7 @@ class Design:
     @property
     def message(self) -> str:
         """The sentence that says what its status means."""
-        return _MESSAGES.get(Status(int(self.status)), "A value is not finite.")
+        return _MESSAGES.get(Status(int(self.status)), message(self.status))
 
 
 _MESSAGES = {
@@ -539,7 +539,6 @@ def design_pendulum(
             vector; bounds not positive, of a parameter that is not free, or without the start; an unknown branch or
             goal; theta1 out of range; g not positive; values traced by `jit`.
         RuntimeError: float64 is switched off in JAX.
-    See also: Nocedal and Wright, Numerical Optimization (2006), chapter 18: sequential quadratic programming.
     """
     require_float64()
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, theta1))):

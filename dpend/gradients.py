@@ -116,7 +116,7 @@ def check_gradient(
     """The derivatives of `loss` at `parameters`, forwards, in reverse, and by finite differences.
 
     Each difference is (f(x + h) - f(x - h))/2h for 15 steps h from 1/32 of the parameter down to 1e-10 of it,
-    extrapolated by Romberg's scheme; of the whole table the entry is taken whose neighbours differ least (Ridders), or
+    extrapolated by Romberg's scheme; of the whole table the entry is taken whose neighbours differ least, or
     whose rounding is less. It costs 30 evaluations for each number among the parameters. A kink of which JAX takes the
     mean slope is not seen.
 
@@ -132,7 +132,6 @@ def check_gradient(
         ValueError: a loss that is not a scalar; parameters that are not finite numbers; no parameters; tolerance not
             positive; as `gradient_horizon`.
         RuntimeError: float64 is switched off in JAX.
-    Source: Ridders, Advances in Engineering Software 4 (1982), as in Numerical Recipes, section 5.7.
     """
     require_float64()
     tolerance = known_number("tolerance", tolerance, positive=True)

@@ -147,7 +147,7 @@ def draw_family(ax, misses_ax, angles, found, misses) -> None:  # type: ignore[n
     for branch, row, colour, mark in zip(BRANCHES, np.transpose(misses), (GREEN, PURPLE), "o^", strict=True):
         misses_ax.semilogy(angles, row, mark + "-", color=colour, markersize=4, label=branch)
     misses_ax.set(
-        xlabel="release angle theta1 (deg)", ylabel="missed after one period (rad)", ylim=(1e-16, 1e-8),
+        xlabel="release angle theta1 (deg)", ylabel="missed after one period (rad)", ylim=(1e-16, 1e-10),
         title="diffrax on Lagrange's equations",
     )  # fmt: skip
     misses_ax.legend(frameon=False, fontsize="small")
@@ -157,9 +157,9 @@ def draw_memory(ax, counts, flown, kept) -> None:  # type: ignore[no-untyped-def
     ax.loglog(counts, np.array(kept) / 1e6, "^--", color=plots.LOWER, markersize=5, label="every step kept")
     ax.loglog(counts, np.array(flown) / 1e6, "o-", color=plots.UPPER, markersize=5, label="dpend.flow, checkpoints")
     ax.axvline(1024, color=plots.NEUTRAL, linewidth=0.8, linestyle=":")
-    ax.annotate("checkpoints from 1024 steps on", (1150, 300), fontsize=8)
+    ax.annotate("checkpoints from\n1024 steps on", (1150, 300), fontsize=8)
     ax.set(xlabel="steps (order 8)", ylabel="memory of jax.grad (MB)", title="Reverse mode")
-    ax.legend(frameon=False, fontsize="small", loc="upper left")
+    ax.legend(frameon=False, fontsize="small", loc="center right")
 
 
 def draw_horizon(ax, horizon, times, apart) -> None:  # type: ignore[no-untyped-def]

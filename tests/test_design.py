@@ -269,6 +269,9 @@ def test_failures_are_statuses(paper):
         lambda orbit: jnp.sqrt(orbit.period - 2.0), paper, "g", branch="in-phase", theta1=SIXTY
     )
     assert poisoned.status == Status.NONFINITE
+    beyond = dpend.design_pendulum(one_second, paper, "g", branch="in-phase", theta1=3.14159)
+    assert beyond.status == Status.NO_SUCH_ORBIT
+    assert "where the branch ends" in beyond.message
 
 
 @pytest.mark.parametrize(
