@@ -50,6 +50,7 @@ def test_a_pole():
     assert dpend.check_gradient(jnp.sqrt, 0.0).status == Status.NONFINITE
 
 
+@pytest.mark.slow
 def test_forward_only(paper):
     """Through a loop of unknown length there is no reverse mode."""
 
@@ -71,10 +72,8 @@ def end_angle(paper, duration, scheme, state):
     return dpend.flow(paper, state, duration, scheme).theta1
 
 
-@pytest.mark.parametrize(
-    ("duration", "status"),
-    [pytest.param(1.0, Status.CONVERGED, marks=pytest.mark.slow), (10.0, Status.BEYOND_HORIZON)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("duration", "status"), [(1.0, Status.CONVERGED), (10.0, Status.BEYOND_HORIZON)])
 def test_a_chaotic_motion_is_believed_up_to_its_horizon(paper, duration, status):
     scheme, state = Scheme("rk4", 2e-3), dpend.released(*CHAOTIC)
     loss = jax.jit(partial(end_angle, paper, duration, scheme))
@@ -85,17 +84,16 @@ def test_a_chaotic_motion_is_believed_up_to_its_horizon(paper, duration, status)
 
 
 def test_the_horizon_of_the_papers_chaotic_motion(paper):
-    """Ten times finer steps gain next to nothing once rounding is what grows; coarse ones lose."""
+    """A coarse step loses; the growth is the motion's own, whatever the step."""
     state = dpend.released(*CHAOTIC)
-    found = {step: dpend.gradient_horizon(paper, state, 12.8, Scheme("rk8", step)) for step in (5e-3, 1e-3)}
-    assert 5 < found[5e-3].horizon < 8 < found[1e-3].horizon < 10
+    found = {step: dpend.gradient_horizon(paper, state, 12.8, Scheme("rk8", step)) for step in (5e-3, 2e-3)}
+    assert 5 < found[5e-3].horizon < 8 < found[2e-3].horizon < 10
     for one in found.values():
         assert one.status == Status.BEYOND_HORIZON
         here = np.searchsorted(one.time, one.horizon)
         assert one.error[here] <= 1e-3 < one.error[here + 1]
-    # The growth itself is the motion's, not the step's: 2.3 per second, times as long as it was right.
-    early = found[1e-3].time < 5
-    np.testing.assert_allclose(found[5e-3].growth[early], found[1e-3].growth[early], rtol=1e-3)
+    early = found[2e-3].time < 5
+    np.testing.assert_allclose(found[5e-3].growth[early], found[2e-3].growth[early], rtol=1e-3)
 
 
 @pytest.mark.slow
