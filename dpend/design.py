@@ -314,15 +314,18 @@ def _nearest_of_many(problem: _Problem, look: _Look, most: int) -> tuple[_Look, 
         return found, steps, status
     closest, more, how = _least(problem, found, most, _square)
     steps += more
-    solved = bool(np.max(np.abs(closest.value)) <= _SOLVED * np.max(np.abs(look.value)))
-    solutions = []
-    for begin in (closest,) if solved else (closest, *_beginnings(problem, look, most)):
+    found, more, status = _nearest(problem, closest, most)
+    steps += more
+    if status != Status.CONVERGED and np.max(np.abs(closest.value)) <= _SOLVED * np.max(np.abs(look.value)):
+        return closest, steps, int(Status.MAX_ITERATIONS)  # a solution, but on the way to the nearest one it stalled
+    solutions = [found] if status == Status.CONVERGED else []
+    for begin in _beginnings(problem, look, most):
         found, more, status = _nearest(problem, begin, most)
         steps += more
         if status == Status.CONVERGED:
             solutions.append(found)
     if not solutions:
-        return closest, steps, int(Status.MAX_ITERATIONS) if solved else _without_solution(how)
+        return closest, steps, _without_solution(how)
     return min(solutions, key=lambda one: float(np.linalg.norm(one.x))), steps, int(Status.CONVERGED)
 
 
