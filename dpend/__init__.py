@@ -9,11 +9,17 @@ from dpend.atlas import Atlas as Atlas
 from dpend.atlas import Coverage as Coverage
 from dpend.atlas import find_brake_orbits as find_brake_orbits
 from dpend.atlas import load_atlas as load_atlas
+from dpend.design import Design as Design
+from dpend.design import design_pendulum as design_pendulum
 from dpend.events import Crossing as Crossing
 from dpend.events import first_crossing as first_crossing
 from dpend.families import Family as Family
 from dpend.families import SpecialPoint as SpecialPoint
 from dpend.families import follow_family as follow_family
+from dpend.gradients import GradientCheck as GradientCheck
+from dpend.gradients import GradientHorizon as GradientHorizon
+from dpend.gradients import check_gradient as check_gradient
+from dpend.gradients import gradient_horizon as gradient_horizon
 from dpend.orbits import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits import find_orbit as find_orbit
 from dpend.pendulum import BobEnergies as BobEnergies

@@ -194,6 +194,49 @@ def atlas(
 
 
 @app.command()
+def design(
+    theta1: _Theta1,
+    branch: Annotated[
+        str | None, typer.Option(help="in-phase or anti-phase: whose orbit --period and --kappa are about.")
+    ] = None,
+    period: Annotated[float | None, _numeric(help="Wanted period [s].")] = None,
+    kappa: Annotated[float | None, _numeric(help="Wanted kappa: stable from -1 to 1, most so at 0.")] = None,
+    ratio: Annotated[
+        float | None, _numeric(help="Wanted period of the in-phase orbit over that of the anti-phase orbit.")
+    ] = None,
+    free: Annotated[str, typer.Option(metavar="NAMES", help="What may change, of l1,l2,m1,m2,g,theta1.")] = "l1,l2",
+    bounds: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=A:B", help="Bounds of one of them (theta1 in degrees); once a name."),
+    ] = None,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """The pendulum nearest to this one whose orbit released at THETA1 has a wanted period, stability, or both."""
+    start = Pendulum(l1, l2, m1, m2, g)
+    equations, branches = _asked(branch, period, kappa, ratio)
+
+    def loss(*orbits: PeriodicOrbit) -> Any:
+        by_name = dict(zip(branches, orbits, strict=True))
+        return jax.numpy.stack([equation(by_name) for equation in equations.values()])
+
+    names = tuple(name.strip() for name in free.split(","))
+    found = dpend.design_pendulum(
+        loss, start, names, branch=branches, theta1=_radians("theta1", theta1), bounds=_bounds(bounds or [])
+    )
+    record = _design_record(found, start, branches, tuple(equations))
+    if as_json:
+        _print_json(record)
+    else:
+        _print_design(found, record, start, theta1)
+    return 0 if int(found.status) == Status.CONVERGED else 1
+
+
+@app.command()
 def simulate(
     theta1: _Theta1,
     theta2: Annotated[float, _numeric(help="Release angle of the lower rod [deg].")],
@@ -360,6 +403,44 @@ def _radians(name: str, degrees: float) -> float:
     return math.radians(number(name, degrees, unit="deg"))
 
 
+def _asked(
+    branch: str | None, period: float | None, kappa: float | None, ratio: float | None
+) -> tuple[dict[str, Callable[[dict[str, PeriodicOrbit]], Any]], tuple[str, ...]]:
+    """The equations of a design, each a function of the orbits by branch, and the branches whose orbits it takes."""
+    if period is None and kappa is None and ratio is None:
+        raise ValueError("period, kappa or ratio must be given, got none of them: say what is wanted")
+    if branch is None and (period is not None or kappa is not None):
+        raise ValueError(f"branch must be given with period and kappa, got none: give {' or '.join(BRANCHES)}")
+    if branch is not None and branch not in BRANCHES:
+        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    equations: dict[str, Callable[[dict[str, PeriodicOrbit]], Any]] = {}
+    if period is not None:
+        seconds = float(number("period", period, positive=True, unit="s"))
+        equations["period_s"] = lambda orbits: orbits[str(branch)].period - seconds
+    if kappa is not None:
+        middle = float(number("kappa", kappa))
+        equations["kappa"] = lambda orbits: orbits[str(branch)].kappa - middle
+    if ratio is not None:
+        wanted = float(number("ratio", ratio, positive=True))
+        equations["ratio"] = lambda orbits: orbits["in-phase"].period / orbits["anti-phase"].period - wanted
+    return equations, BRANCHES if ratio is not None else (str(branch),)
+
+
+def _bounds(texts: list[str]) -> dict[str, tuple[float, float]]:
+    """Bounds by name, of theta1 in radians."""
+    bounds = {}
+    for text in texts:
+        name, _, span = text.partition("=")
+        try:
+            low, high = (float(part) for part in span.split(":"))
+        except ValueError:
+            raise ValueError(f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5") from None
+        if name in bounds:
+            raise ValueError(f"bounds must be given once a name, got {name} twice: leave one out")
+        bounds[name] = (math.radians(low), math.radians(high)) if name == "theta1" else (low, high)
+    return bounds
+
+
 _MAPS = {
     "lyapunov": dpend.chaos.lyapunov,
     "megno": dpend.chaos.megno,
@@ -501,6 +582,32 @@ def _motion_record(motion: Trajectory) -> dict[str, Any]:
     }
 
 
+def _design_record(
+    found: dpend.Design, start: Pendulum, branches: tuple[str, ...], equations: tuple[str, ...]
+) -> dict[str, Any]:
+    status = Status(int(found.status))
+    units = {"theta2_deg": ("theta2", math.degrees(1.0)), "period_s": ("period", 1.0), "kappa": ("kappa", 1.0)}
+    orbits = []
+    for i, (name, orbit) in enumerate(zip(branches, found.orbits, strict=True)):
+        slopes = {
+            key: {parameter: unit * float(np.atleast_1d(row)[i]) for parameter, row in found.sensitivities[of].items()}
+            for key, (of, unit) in units.items()
+        }
+        orbits.append(_orbit_record(orbit) | {"branch": name, "sensitivities": slopes})
+    return {
+        "pendulum": pendulum_record(found.pendulum),
+        "orbits": orbits,
+        "missed": dict(zip(equations, np.atleast_1d(found.loss).tolist(), strict=True)),
+        "distance": float(found.distance),
+        "at_bounds": list(found.at_bounds),
+        "iterations": int(found.iterations),
+        "looks": int(found.looks),
+        "status": status.name.lower(),
+        "message": found.message,
+        "start": pendulum_record(start),
+    }
+
+
 def _degrees(radians: Any) -> float:
     return math.degrees(float(radians))
 
@@ -626,6 +733,37 @@ def _family_row(atlas: dpend.Atlas, record: dict[str, Any]) -> list[str]:
 def _described(pendulum: Pendulum) -> str:
     values = (float(value) for value in jax.tree.leaves(pendulum))
     return "l1 = {:g} m, l2 = {:g} m, m1 = {:g} kg, m2 = {:g} kg, g = {:g} m/s^2, released from rest".format(*values)
+
+
+def _print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, theta1: float) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    branches = (orbit["branch"] for orbit in record["orbits"])
+    _print_orbits(found.pendulum, dict(zip(branches, found.orbits, strict=True)))
+    table = Table(title="derivatives with respect to the logarithms", title_justify="left", title_style="")
+    table.add_column("")
+    for heading in ("start", "found"):
+        table.add_column(heading, justify="right")
+    for orbit in record["orbits"]:
+        for heading in ("period (s)", "kappa", "theta2 (deg)"):
+            table.add_column(f"{orbit['branch']}\n{heading}", justify="right")
+    units = {"l1": "m", "l2": "m", "m1": "kg", "m2": "kg", "g": "m/s^2", "theta1": "deg"}
+    angle = record["orbits"][0]["theta1_deg"]
+    values = [*jax.tree.leaves(start), theta1], [*jax.tree.leaves(found.pendulum), angle]
+    for (name, unit), before, after in zip(units.items(), *values, strict=True):
+        slopes = [orbit["sensitivities"][key][name] for orbit in record["orbits"] for key in _SLOPES]
+        row = [f"{float(before):g}", f"{float(after):.10g}", *(f"{slope:.6g}" for slope in slopes)]
+        table.add_row(f"{name} ({unit})", *row)
+    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    missed = ", ".join(f"{name} {value:.0e}" for name, value in record["missed"].items())
+    print(f"{record['iterations']} steps, {record['looks']} solves; misses {missed}; logarithms changed by", end=" ")
+    print(f"{record['distance']:.6g}" + (f"; at bounds: {', '.join(found.at_bounds)}" if found.at_bounds else ""))
+    if record["status"] != "converged":
+        print(f"{record['status']}: {record['message']}")
+
+
+_SLOPES = ("period_s", "kappa", "theta2_deg")
 
 
 def _print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) -> None:

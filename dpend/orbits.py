@@ -498,6 +498,27 @@ def _orbit(
     )
 
 
+@jax.jit
+def slopes(orbit: PeriodicOrbit) -> Float[Array, "4 6"]:
+    """Derivatives of what is known of a centred orbit by the implicit function theorem, without solving it again.
+
+    Returns:
+        Of theta2, log T, kappa and log |kappa| (rows) with respect to l1, l2, m1, m2, g and theta1.
+    """
+    pendulum, theta1, theta2, log_time = orbit.pendulum, orbit.theta1, orbit.theta2, jnp.log(0.25 * orbit.period)
+    line = _Line(jnp.stack([theta1, 0.0]), jnp.array([0.0, 1.0]))
+    rate, _ = _rate_along(pendulum, line, theta2, log_time, _steps_for(log_time, _clock(pendulum), _FINE))
+    steps = _steps_for(log_time, rate, _FINE).astype(jnp.float64)
+    kappas = jnp.stack([orbit.kappa, orbit.log_abs_kappa])
+
+    def known(parameters: Array) -> Array:
+        base = jnp.append(parameters, 0.0)
+        root = _implicit("centred", jnp.stack([theta2, log_time]), base, line.direction, steps)
+        return jnp.concatenate([root, _kappas("centred", kappas, jnp.concatenate([parameters, root]), steps)])
+
+    return jax.jacfwd(known)(jnp.stack([*jax.tree.leaves(pendulum), theta1]))
+
+
 def mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
     """The mirror image x -> -x where `sign`, of the leaves' shape, is -1."""
     state, dual = (jax.tree.map(lambda leaf: sign * leaf, x) for x in (orbit.state, orbit.dual))

@@ -38,6 +38,8 @@ class Status(IntEnum):
     DRIFT_ABOVE_TOLERANCE = 7
     NONFINITE = 8
     BEYOND_HORIZON = 9
+    NO_SOLUTION = 12
+    DISAGREEMENT = 13
     NOT_COMPUTED = 255
 
 
@@ -55,6 +57,8 @@ _MESSAGES = {
     Status.NONFINITE: "A value is not finite.",
     Status.BEYOND_HORIZON: "The error estimate exceeds what was asked, or 0.1 rad: the end of this motion is not to be "
     "believed; shorten it, or use a smaller step while that still helps.",
+    Status.NO_SOLUTION: "Nothing within the bounds satisfies the equations; what comes nearest is returned.",
+    Status.DISAGREEMENT: "A derivative differs from the finite difference by more than their errors explain.",
     Status.NOT_COMPUTED: "Not computed.",
 }
 

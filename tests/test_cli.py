@@ -51,6 +51,50 @@ def test_both_partners_of_forty_degrees(capsys):
     assert abs(inner["energy_J"] - expected) < 1e-12
 
 
+def test_a_design(capsys):
+    command = ("design", "--branch", "in-phase", "--theta1", 60, "--period", 1.0, "--free", "l1,l2")
+    status, found = run_json(capsys, *command)
+    assert (status, found["status"], found["at_bounds"]) == (0, "converged", [])
+    orbit, pendulum = found["orbits"][0], found["pendulum"]
+    assert abs(orbit["period_s"] - 1) < 1e-13
+    assert abs(found["missed"]["period_s"]) < 1e-13
+    assert (pendulum["m1_kg"], found["start"]["l1_m"]) == (0.1, 0.2)
+    changes = [np.log(pendulum[key] / 0.2) for key in ("l1_m", "l2_m")]
+    assert abs(np.hypot(*changes) - found["distance"]) < 1e-12
+    # T goes as the root of a length: no less can be known of the sensitivities.
+    rates = orbit["sensitivities"]["period_s"]
+    assert abs(rates["l1"] + rates["l2"] - 0.5) < 1e-10
+    status, out, _ = run(capsys, *command, "--bounds", "l1=0.15:0.25", "--bounds", "l2=0.15:0.25")
+    assert status == 1
+    assert "at bounds: l1, l2" in out
+    assert "no_solution: No solution was found within the bounds" in out
+    status, both = run_json(capsys, "design", "--theta1", 60, "--ratio", 2, "--free", "l1,l2")
+    slow, fast = both["orbits"]
+    assert (status, slow["branch"], fast["branch"]) == (0, "in-phase", "anti-phase")
+    assert abs(slow["period_s"] / fast["period_s"] - 2) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ((), "period, kappa or ratio must be given"),
+        (("--period", 1), "branch must be given with period and kappa"),
+        (("--branch", "x", "--period", 1), "branch must be one of in-phase, anti-phase, got 'x'"),
+        (("--branch", "in-phase", "--period", -1), "period must be a finite positive number"),
+        (("--branch", "in-phase", "--kappa", "0", "--free", "l1,x"), "free must name one or more of"),
+        (("--branch", "in-phase", "--kappa", 0, "--period", 1, "--free", "g"), "free must name as many parameters"),
+        (("--ratio", 2, "--bounds", "l1=1"), "bounds must be NAME=A:B, got 'l1=1'"),
+        (("--ratio", 2, "--bounds", "l1=.1:.3", "--bounds", "l1=.1:.4"), "bounds must be given once a name"),
+        (("--ratio", 2, "--bounds", "l1=.3:.4"), "bounds of l1 must be two numbers with the start"),
+    ],
+)
+def test_bad_designs_are_refused_in_one_line(capsys, options, text):
+    status, out, err = run(capsys, "design", "--theta1", 60, *options)
+    assert (status, out) == (2, "")
+    assert err.startswith("dpend: " + text)
+    assert err.count("\n") == 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("quantity", "value"), [("flip", "flip_time"), ("lyapunov", "lyapunov")])
 def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
