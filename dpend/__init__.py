@@ -14,6 +14,9 @@ from dpend.events import first_crossing as first_crossing
 from dpend.families import Family as Family
 from dpend.families import SpecialPoint as SpecialPoint
 from dpend.families import follow_family as follow_family
+from dpend.fit import Fit as Fit
+from dpend.fit import fit_parameters as fit_parameters
+from dpend.measurements import load_angles as load_angles
 from dpend.orbits import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits import find_orbit as find_orbit
 from dpend.pendulum import BobEnergies as BobEnergies

@@ -38,13 +38,15 @@ class Status(IntEnum):
     DRIFT_ABOVE_TOLERANCE = 7
     NONFINITE = 8
     BEYOND_HORIZON = 9
+    MISFIT = 10
     NOT_COMPUTED = 255
 
 
 _MESSAGES = {
     Status.CONVERGED: "Converged.",
     Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations; try a closer guess.",
-    Status.SINGULAR: "The equations are singular here, as at a fold of the family; try another release angle.",
+    Status.SINGULAR: "The equations are singular here, as at a fold of the family, or where data do not determine what "
+    "is asked; try another release angle, or hold what has no finite standard error.",
     Status.LEFT_BRANCH: "The branch could not be followed to this release: no step was short enough to stay on it, or "
     "the orbit found is not on it; the best so far is returned.",
     Status.NO_SUCH_ORBIT: "The branch ends without reaching this release; its largest |theta1| is returned.",
@@ -55,6 +57,8 @@ _MESSAGES = {
     Status.NONFINITE: "A value is not finite.",
     Status.BEYOND_HORIZON: "The error estimate exceeds what was asked, or 0.1 rad: the end of this motion is not to be "
     "believed; shorten it, or use a smaller step while that still helps.",
+    Status.MISFIT: "What is left of the data is far above their noise, or not noise: the fit is not to be believed; "
+    "check units, times and what is held, or try a closer guess.",
     Status.NOT_COMPUTED: "Not computed.",
 }
 
