@@ -140,10 +140,10 @@ def _cell(text: str, name: str, line: int, path: Path, gaps: bool) -> float:
 # Turns from sample to sample [rad], in the median: beyond this nobody can tell which way a rod went.
 _LARGEST_TURN = 1.0
 # The share of its own size, in squares, that the equation of motion is missed by: above the first it may be the wrong
-# unit, and is, if another misses by less than the second times that. In the right unit half a degree of noise at 60
-# frames a second makes 0.01 to 0.1 of it, 5 degrees or 20 frames a second 0.2 to 0.3; swings of 90 degrees and more in
-# the wrong one miss by 0.5 to 1, and three times as much as in the right one.
-_DISOBEYED, _BETTER = 0.35, 0.5
+# unit, and is, if another misses by less than the second times that. Swings in the right unit miss by 0.01 to 0.1 with
+# half a degree of noise at 60 frames a second, by 0.2 to 0.3 with 5 degrees or at 20 frames, never by twice as much as
+# in a wrong one; swings of 90 degrees and more miss by 0.5 to 1 in the wrong one.
+_DISOBEYED, _BETTER = 0.1, 0.4
 
 
 def _check(series: Angles, there: list[bool], where: Callable[[str, int], str], unit: str) -> None:
@@ -178,7 +178,7 @@ def _check_unit(series: Angles, where: Callable[[str, int], str], unit: str) -> 
         return
     for factor, other in ((math.pi / 180, "in degrees"), (180 / math.pi, "in radians")):
         if _disobedience(series, factor) < _BETTER * missed:
-            got = other if unit == "in radians" or other == "in radians" else "converted to radians twice"
+            got = f"{other}, converted twice" if other == unit else other
             raise ValueError(
                 f"{where('theta1', 0)} and what follows must be {unit}, got angles that obey the equations of a double "
                 f"pendulum only if they are {got}: convert them"

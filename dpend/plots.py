@@ -253,7 +253,7 @@ def _no_flip(dataset: Any, ax: "Axes", across: str) -> None:
 
 
 def residuals(fit: Fit) -> "Figure":
-    """A fit over its data: the angles [deg], and what is left of them, with the noise's band of twice its width.
+    """A fit over its data: the angles [deg], and what is left of them beside a band of twice the noise to either side.
 
     Measured angles are dots, shown in the turn in which the fitted motion is, which is drawn as a line; blue for the
     upper rod and vermilion for the lower.
@@ -271,7 +271,7 @@ def residuals(fit: Fit) -> "Figure":
         ax.axhspan(-band, band, color=NEUTRAL, alpha=0.15, linewidth=0)
         ax.axhline(0, color=NEUTRAL, linewidth=0.8)
         ax.plot(fit.time, np.degrees(left), ".", color=colour, markersize=3)
-        ax.set_ylabel(f"{name} left (deg)")
+        ax.set_ylabel(f"{name} residual (deg)", fontsize="small")
     grid[0].set_ylabel("angle (deg)")
     grid[2].set_xlabel("time (s)")
     _legend_above(grid[0], columns=2)

@@ -285,8 +285,8 @@ _FAR = 0.5
 _MOST_TRIALS, _MOST_ITERATIONS = 25, 25
 # A round is over when an iteration that is damped by no more than the second gains less than the first, of the cost.
 _LITTLE, _FREELY = 0.1, 1e-2
-# The last iteration moves no parameter by more than this share of its standard error, or by rounding, which data without
-# noise show as small moves that do not shrink.
+# The last iteration moves no parameter by more than this share of its standard error, or by rounding, which data
+# without noise show as small moves that do not shrink.
 _TOLERANCE, _ROUNDING, _NOISE = 1e-4, 1e-12, 1e-8
 # Joints that miss by this [rad, rad/s] are closed: rounding over a window at tens of rad/s is some 1e-13.
 _CLOSED = 1e-9
