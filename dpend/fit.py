@@ -389,6 +389,8 @@ def fit_parameters(
     """
     require_float64()
     pendulum = Pendulum() if pendulum is None else pendulum
+    if not isinstance(pendulum, Pendulum):
+        raise ValueError(f"pendulum must be a Pendulum, got {pendulum!r:.60}: give dpend.Pendulum(l1=...)")
     names = _checked_free(free)
     numbers = Pendulum(*(known_number(name, getattr(pendulum, name)) for name in _BY_FIELD))
     if "g" in names and numbers.g == 0:
@@ -407,9 +409,9 @@ def fit_parameters(
 
 
 def _checked_free(free: Any) -> tuple[str, ...]:
-    names = tuple([free] if isinstance(free, str) else free)
+    names = (free,) if isinstance(free, str) or not hasattr(free, "__iter__") else tuple(free)
     for name in names:
-        if name not in _BY_FIELD or names.count(name) > 1:
+        if name not in tuple(_BY_FIELD) or names.count(name) > 1:
             raise ValueError(
                 f"free must hold each of {', '.join(_BY_FIELD)} once at most, got {', '.join(map(str, names))}"
             )
@@ -421,7 +423,7 @@ def _checked_free(free: Any) -> tuple[str, ...]:
 
 
 def _checked_initial(initial: Any) -> tuple[float | None, ...]:
-    values = tuple(initial)
+    values = tuple(initial) if hasattr(initial, "__iter__") else (initial,)
     if len(values) != len(INITIAL):
         raise ValueError(
             f"initial must be {', '.join(INITIAL)}, got {len(values)} values: give None for what is estimated"

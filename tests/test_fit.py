@@ -218,6 +218,27 @@ def test_calm_swings_have_honest_errors(paper):
     assert np.all(np.abs(np.sqrt(np.mean(z**2, axis=0)) - 1) < 0.3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("pendulum", "release", "every", "noise"),
+    [
+        (Pendulum(m2=1.0), (120, 60), 1, 0.5),
+        (Pendulum(m2=0.01), (120, 60), 1, 0.5),
+        (Pendulum(l1=1.0, l2=0.5), (150, 60), 2, 1.0),
+        (Pendulum(), (170, 180), 4, 0.5),
+        (Pendulum(), (170, 180), 1, 5.0),
+        (Pendulum(), (170, 180), 1, 0.01),
+    ],
+)
+def test_masses_lengths_frames_and_noise(pendulum, release, every, noise):
+    """Fifteen frames a second, five degrees of noise, a hundredth: all the same."""
+    times, angles = FRAMES[::every], motion(pendulum, *release)[:, ::FINE][:, ::every]
+    fit = fit_parameters(times, *noisy(angles, 0, np.radians(noise)), pendulum=off(pendulum))
+    assert fit.status == Status.CONVERGED
+    assert np.max(np.abs(scores(fit, pendulum))) < 3.5
+    np.testing.assert_allclose(np.degrees(fit.noise), noise, rtol=0.1)
+
+
 # --- what cannot be known, and what is not so ------------------------------------------------------------------------
 
 
@@ -272,6 +293,8 @@ def changed(column, index, value):
     [
         (GOOD, {"free": ("l1", "l2", "g")}, "free must not hold l1, l2 and g: .* fix one of l1, l2, g"),
         (GOOD, {"free": ("m1", "m2")}, "free must not hold m1 and m2: .* fix one of m1, m2"),
+        (GOOD, {"pendulum": 0.2}, "pendulum must be a Pendulum, got 0.2"),
+        (GOOD, {"free": 5}, "free must hold each of l1, l2, m1, m2, g once at most, got 5"),
         (GOOD, {"free": ("l3",)}, "free must hold each of l1, l2, m1, m2, g once at most, got l3"),
         (GOOD, {"pendulum": Pendulum(g=0.0)}, "g must not start at 0 where it is free"),
         (GOOD, {"initial": (None, None)}, "initial must be theta1, theta2, omega1, omega2, got 2"),
