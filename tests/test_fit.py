@@ -85,10 +85,10 @@ def test_a_hundred_trials(paper, chaos):
 
 
 def test_wrapped_and_mirrored_angles_give_the_same(paper, chaos):
-    data, guess = noisy(chaos, 0), off(paper)
-    plain = fit_parameters(FRAMES, *data, pendulum=guess)
-    wrapped = fit_parameters(FRAMES, *((data + np.pi) % (2 * np.pi) - np.pi), pendulum=guess)
-    mirrored = fit_parameters(FRAMES, *-data, pendulum=guess)
+    times, data, guess = FRAMES[:400], noisy(chaos, 0)[:, :400], off(paper)
+    plain = fit_parameters(times, *data, pendulum=guess)
+    wrapped = fit_parameters(times, *((data + np.pi) % (2 * np.pi) - np.pi), pendulum=guess)
+    mirrored = fit_parameters(times, *-data, pendulum=guess)
     for other in (wrapped, mirrored):
         for name in RATIOS:
             assert abs(other.estimates[name] - plain.estimates[name]) < 1e-3 * plain.standard_errors[name]
@@ -133,9 +133,9 @@ def test_a_release_from_rest_tells_more(paper, chaos):
 
 
 def test_least_squares_by_scipy_agree():
-    """Swings of 1.5 s, shot at in one piece with DOP853 and the equations of motion written by hand."""
-    pendulum, times = Pendulum(), np.linspace(0.0, 1.5, 91)
-    data = noisy(motion(pendulum, 50, 20)[:, ::FINE][:, :91], 5)
+    """Swings of 1 s, shot at in one piece with DOP853 and the equations of motion written by hand."""
+    pendulum, times = Pendulum(), np.linspace(0.0, 1.0, 61)
+    data = noisy(motion(pendulum, 50, 20)[:, : 61 * FINE : FINE], 5)
     fit = fit_parameters(times, *data, pendulum=off(pendulum), noise=HALF)
 
     def residuals(x):
@@ -150,18 +150,20 @@ def test_least_squares_by_scipy_agree():
             ]
             return np.concatenate([y[2:], np.linalg.solve(inertia, force)])
 
-        y = solve_ivp(slope, (0, 1.5), x[3:], method="DOP853", t_eval=times, rtol=1e-10, atol=1e-12).y
+        y = solve_ivp(slope, (0, 1), x[3:], method="DOP853", t_eval=times, rtol=1e-9, atol=1e-11).y
         return ((y[:2] - data) / HALF).ravel()
 
     start = np.concatenate([np.log([1.0, 1.0, 49.0]), np.radians([50, 20]), [0, 0]])
     best = least_squares(residuals, start, method="lm", x_scale=[0.1, 0.1, 0.1, 0.1, 0.1, 1, 1], xtol=1e-12)
-    covariance = np.linalg.inv(best.jac.T @ best.jac)
+    moves = 1e-3 * np.eye(7)
+    jacobian = np.array([residuals(best.x + move) - residuals(best.x - move) for move in moves]).T / 2e-3
     units = np.concatenate([[0.2, 0.1, 0.2] * np.exp(best.x[:3]), np.ones(4)])
+    covariance = np.linalg.inv(jacobian.T @ jacobian) * np.outer(units, units)
     ours = [fit.estimates[k] for k in ("l2", "m2", "g", "theta1", "theta2", "omega1", "omega2")]
-    errors = np.sqrt(np.diag(covariance)) * units
-    assert np.max(np.abs(np.append(units[:3], best.x[3:]) - ours) / errors) < 2e-3
+    errors = np.sqrt(np.diag(covariance))
+    assert np.max(np.abs(np.append(units[:3], best.x[3:]) - ours) / errors) < 5e-3
     np.testing.assert_allclose(
-        fit.covariance, covariance * np.outer(units, units), rtol=0.01, atol=0.005 * errors.min() ** 2
+        fit.covariance / np.outer(errors, errors), covariance / np.outer(errors, errors), atol=2e-3
     )
 
 
@@ -171,10 +173,10 @@ def test_gaps(paper, chaos):
     data[0, 300:330] = np.nan
     data[np.random.default_rng(4).random(data.shape) < 0.05] = np.nan
     data[0, 0] = 3.0
-    fit = fit_parameters(FRAMES[:600], *data[:, :600], pendulum=off(paper))
+    fit = fit_parameters(FRAMES[:400], *data[:, :400], pendulum=off(paper))
     assert fit.status == Status.CONVERGED
     assert np.max(np.abs(scores(fit, paper))) < 3
-    np.testing.assert_array_equal(np.isnan(fit.residual1), np.isnan(data[0, :600]))
+    np.testing.assert_array_equal(np.isnan(fit.residual1), np.isnan(data[0, :400]))
     truth = chaos[:, 100:130] - 2 * np.pi * np.round(
         (chaos[:, 100:130] - [fit.theta1[100:130], fit.theta2[100:130]]) / (2 * np.pi)
     )
@@ -202,7 +204,7 @@ def test_one_rod_is_enough(paper, chaos, seen, frames):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factors", [(a, b, c) for a in (0.5, 2.0) for b in (0.5, 2.0) for c in (0.5, 2.0)])
+@pytest.mark.parametrize("factors", [(0.5, 2.0, 0.5), (2.0, 0.5, 2.0), (0.5, 0.5, 2.0), (2.0, 2.0, 0.5)])
 def test_guesses_off_by_two(paper, chaos, factors):
     fit = fit_parameters(FRAMES, *noisy(chaos, 7), pendulum=off(paper, *factors))
     assert fit.status == Status.CONVERGED
@@ -212,10 +214,10 @@ def test_guesses_off_by_two(paper, chaos, factors):
 @pytest.mark.slow
 def test_calm_swings_have_honest_errors(paper):
     angles = motion(paper, 30, 10)[:, ::FINE]
-    fits = [fit_parameters(FRAMES, *noisy(angles, seed), pendulum=off(paper)) for seed in range(40)]
+    fits = [fit_parameters(FRAMES, *noisy(angles, seed), pendulum=off(paper)) for seed in range(20)]
     assert all(fit.status == Status.CONVERGED for fit in fits)
     z = np.array([scores(fit, paper) for fit in fits])
-    assert np.all(np.abs(np.sqrt(np.mean(z**2, axis=0)) - 1) < 0.3)
+    assert np.all(np.abs(np.sqrt(np.mean(z**2, axis=0)) - 1) < 0.4)
 
 
 @pytest.mark.slow
@@ -243,11 +245,11 @@ def test_masses_lengths_frames_and_noise(pendulum, release, every, noise):
 
 
 def test_a_pendulum_at_rest_tells_nothing():
-    data = noisy(np.zeros((2, 301)), 0, noise=1e-3)
-    fit = fit_parameters(FRAMES[:301], *data, pendulum=off(Pendulum()))
+    data = noisy(np.zeros((2, 151)), 0, noise=1e-3)
+    fit = fit_parameters(FRAMES[:151], *data, pendulum=off(Pendulum()))
     assert fit.status == Status.SINGULAR
     assert all(fit.standard_errors[name] == np.inf for name in RATIOS)
-    still = fit_parameters(FRAMES[:301], np.zeros(301), np.zeros(301))
+    still = fit_parameters(FRAMES[:61], np.zeros(61), np.zeros(61))
     assert still.status == Status.SINGULAR
     assert all(still.standard_errors[name] == np.inf for name in ("l2", "m2", "g"))
 
