@@ -16,10 +16,13 @@ from dpend.events import first_crossing as first_crossing
 from dpend.families import Family as Family
 from dpend.families import SpecialPoint as SpecialPoint
 from dpend.families import follow_family as follow_family
+from dpend.fit import Fit as Fit
+from dpend.fit import fit_parameters as fit_parameters
 from dpend.gradients import GradientCheck as GradientCheck
 from dpend.gradients import GradientHorizon as GradientHorizon
 from dpend.gradients import check_gradient as check_gradient
 from dpend.gradients import gradient_horizon as gradient_horizon
+from dpend.measurements import load_angles as load_angles
 from dpend.orbits import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits import find_orbit as find_orbit
 from dpend.pendulum import BobEnergies as BobEnergies

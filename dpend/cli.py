@@ -396,6 +396,46 @@ def animate(
     return 0 if all(int(motion.status) == Status.CONVERGED for motion in motions) else 1
 
 
+@app.command()
+def fit(
+    data: Annotated[Path, typer.Argument(help="A CSV file with columns time_s, theta1_deg, theta2_deg.")],
+    free: Annotated[str, typer.Option(help="What to estimate, of l1, l2, m1, m2, g; the rest is held.")] = "l2,m2,g",
+    at_rest: Annotated[
+        bool, typer.Option("--at-rest", help="The motion was released from rest at the first time.")
+    ] = False,
+    noise: Annotated[float | None, _numeric(help="Standard deviation of the angles [deg], if it is known.")] = None,
+    figure: Annotated[Path | None, typer.Option(help="Draw data, fit and residuals into P.png.")] = None,
+    l1: _Length1 = 0.2,
+    l2: _Length2 = 0.2,
+    m1: _Mass1 = 0.1,
+    m2: _Mass2 = 0.1,
+    g: _Gravity = 9.8,
+    as_json: _Json = False,
+) -> int:
+    """The pendulum whose motion is nearest to measured angles, from a guess of it; one rod or single cells may lack."""
+    if figure is not None:
+        check_place("figure", figure, (".png",))
+    sigma = None if noise is None else math.radians(number("noise", noise, positive=True, unit="deg"))
+    times, theta1, theta2 = dpend.load_angles(data)
+    found = dpend.fit_parameters(
+        times,
+        theta1,
+        theta2,
+        pendulum=Pendulum(l1, l2, m1, m2, g),
+        free=tuple(name.strip() for name in free.split(",") if name.strip()),
+        initial=(None, None, 0.0, 0.0) if at_rest else (None,) * 4,
+        noise=sigma,
+    )
+    if figure is not None:
+        _draw_fit(found, figure)
+    record = _fit_record(found)
+    if as_json:
+        _print_json(record)
+    else:
+        _print_fit(record, figure)
+    return 0 if int(found.status) == Status.CONVERGED else 1
+
+
 # --- what is read ----------------------------------------------------------------------------------------------------
 
 
@@ -608,6 +648,40 @@ def _design_record(
     }
 
 
+# How an estimate is shown: its name with its unit, and what it is multiplied by.
+_SHOWN = {
+    "l1": ("l1_m", 1.0), "l2": ("l2_m", 1.0), "m1": ("m1_kg", 1.0), "m2": ("m2_kg", 1.0), "g": ("g_m_s2", 1.0),
+    "l2/l1": ("l2/l1", 1.0), "m2/m1": ("m2/m1", 1.0), "g/l1": ("g/l1_s-2", 1.0),
+    "theta1": ("theta1_deg", math.degrees(1.0)), "theta2": ("theta2_deg", math.degrees(1.0)),
+    "omega1": ("omega1_deg_s", math.degrees(1.0)), "omega2": ("omega2_deg_s", math.degrees(1.0)),
+}  # fmt: skip
+
+
+def _fit_record(fit: dpend.Fit) -> dict[str, Any]:
+    status = Status(int(fit.status))
+    measured = np.sum(np.isfinite(fit.residual1)) + np.sum(np.isfinite(fit.residual2))
+
+    def shown(values: dict[str, Any]) -> dict[str, float]:
+        return {_SHOWN[name][0]: _SHOWN[name][1] * float(value) for name, value in values.items()}
+
+    return {
+        "estimates": shown(fit.estimates),
+        "standard_errors": shown(fit.standard_errors),
+        "free": list(fit.free),
+        "noise_deg": _degrees(fit.noise),
+        "expected_noise_deg": _degrees(fit.expected_noise),
+        "angles": int(measured),
+        "duration_s": float(fit.time[-1] - fit.time[0]),
+        "windows": int(fit.windows),
+        "iterations": int(fit.iterations),
+        "gap": float(fit.gap),
+        "error_estimate": float(fit.error_estimate),
+        "status": status.name.lower(),
+        "message": dpend.message(status),
+        "pendulum": pendulum_record(fit.pendulum),
+    }
+
+
 def _degrees(radians: Any) -> float:
     return math.degrees(float(radians))
 
@@ -730,6 +804,25 @@ def _family_row(atlas: dpend.Atlas, record: dict[str, Any]) -> list[str]:
     return [record["family"], periods, *record["ends"], str(count)]
 
 
+def _print_fit(record: dict[str, Any], figure: Path | None) -> None:
+    errors = record["standard_errors"]
+    for name, value in record["estimates"].items():
+        error = errors[name]
+        known = "held" if error == 0 else "not determined" if error == math.inf else f"+- {error:.2g}"
+        print(f"{name:14}{value:16.{_decimals(error)}f}  {known}")
+    print(f"{record['angles']} angles over {record['duration_s']:g} s; noise {record['noise_deg']:.3g} deg", end="")
+    print(f", of which {record['expected_noise_deg']:.3g} deg was expected")
+    if record["status"] != "converged":
+        print(f"{record['status']}: {record['message']}")
+    if figure is not None:
+        print(f"drawn in {figure}")
+
+
+def _decimals(error: float) -> int:
+    """As many as show two digits of the error, and six where there is none."""
+    return 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 12)
+
+
 def _described(pendulum: Pendulum) -> str:
     values = (float(value) for value in jax.tree.leaves(pendulum))
     return "l1 = {:g} m, l2 = {:g} m, m1 = {:g} kg, m2 = {:g} kg, g = {:g} m/s^2, released from rest".format(*values)
@@ -833,6 +926,20 @@ def _draw(field: Any, path: Path) -> None:
         plots.map_of(field, name, ax)
     with replacing(path) as draft:
         fig.savefig(draft, dpi=200)
+    plt.close(fig)
+
+
+def _draw_fit(fit: dpend.Fit, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from dpend import plots
+
+    fig = plots.residuals(fit)
+    with replacing(path) as draft:
+        fig.savefig(draft, dpi=150)
     plt.close(fig)
 
 

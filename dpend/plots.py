@@ -1,4 +1,4 @@
-"""Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them) and of maps.
+"""Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them), of maps and of fits.
 
 Each function draws into the axes it is given, or into new ones, and returns them. Colours are from Okabe and Ito's
 palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion for the lower.
@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from dpend.families import Family
+from dpend.fit import Fit
 from dpend.orbits import PeriodicOrbit
 from dpend.pendulum import Pendulum, State, energies, positions
 from dpend.trajectory import Trajectory, simulate
@@ -249,3 +250,29 @@ def _no_flip(dataset: Any, ax: "Axes", across: str) -> None:
     saddle = -abs(weight1 - weight2)
     arguments = (theta1, theta2, height.T) if across == "theta1" else (theta2, theta1, height)
     ax.contour(*arguments, levels=[saddle], colors="black", linewidths=1.0)
+
+
+def residuals(fit: Fit) -> "Figure":
+    """A fit over its data: the angles [deg], and what is left of them beside a band of twice the noise to either side.
+
+    Measured angles are dots, shown in the turn in which the fitted motion is, which is drawn as a line; blue for the
+    upper rod and vermilion for the lower.
+    """
+    import matplotlib.pyplot as plt
+
+    fig, grid = plt.subplots(
+        3, 1, figsize=(9.0, 6.6), sharex=True, layout="constrained", gridspec_kw={"height_ratios": [2.2, 1, 1]}
+    )
+    both = (("theta1", fit.theta1, fit.residual1, UPPER, "-"), ("theta2", fit.theta2, fit.residual2, LOWER, "--"))
+    band = 2 * float(np.degrees(fit.noise))
+    for (name, angle, left, colour, style), ax in zip(both, grid[1:], strict=True):
+        grid[0].plot(fit.time, np.degrees(angle), color=colour, linestyle=style, linewidth=1.0, label=f"{name}, fitted")
+        grid[0].plot(fit.time, np.degrees(angle + left), ".", color=colour, markersize=3, label=f"{name}, measured")
+        ax.axhspan(-band, band, color=NEUTRAL, alpha=0.15, linewidth=0)
+        ax.axhline(0, color=NEUTRAL, linewidth=0.8)
+        ax.plot(fit.time, np.degrees(left), ".", color=colour, markersize=3)
+        ax.set_ylabel(f"{name} residual (deg)", fontsize="small")
+    grid[0].set_ylabel("angle (deg)")
+    grid[2].set_xlabel("time (s)")
+    _legend_above(grid[0], columns=2)
+    return fig

@@ -38,15 +38,17 @@ class Status(IntEnum):
     DRIFT_ABOVE_TOLERANCE = 7
     NONFINITE = 8
     BEYOND_HORIZON = 9
-    NO_SOLUTION = 12
-    DISAGREEMENT = 13
+    MISFIT = 10
+    NO_SOLUTION = 11
+    DISAGREEMENT = 12
     NOT_COMPUTED = 255
 
 
 _MESSAGES = {
     Status.CONVERGED: "Converged.",
     Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations; try a closer guess.",
-    Status.SINGULAR: "The equations are singular here, as at a fold of the family; try another release angle.",
+    Status.SINGULAR: "The equations are singular here, as at a fold of the family, or where data do not determine what "
+    "is asked; try another release angle, or hold what has no finite standard error.",
     Status.LEFT_BRANCH: "The branch could not be followed to this release: no step was short enough to stay on it, or "
     "the orbit found is not on it; the best so far is returned.",
     Status.NO_SUCH_ORBIT: "The branch ends without reaching this release; its largest |theta1| is returned.",
@@ -59,6 +61,8 @@ _MESSAGES = {
     "believed; shorten it, or use a smaller step while that still helps.",
     Status.NO_SOLUTION: "Nothing within the bounds satisfies the equations; what comes nearest is returned.",
     Status.DISAGREEMENT: "A derivative differs from the finite difference by more than their errors explain.",
+    Status.MISFIT: "What is left of the data is far above their noise, or not noise: the fit is not to be believed; "
+    "check units, times and what is held, or try a closer guess.",
     Status.NOT_COMPUTED: "Not computed.",
 }
 

@@ -1,0 +1,540 @@
+"""A pendulum from measured angles: lengths, masses, gravity and the state at the first time, with their errors.
+
+A chaotic motion forgets where it began after a second or so, and the sum of squares as a function of the initial state
+then has a minimum at every turn. So the motion is cut into short windows (`windows`), whose initial states all start
+from the data, as local cubics through them, whatever the parameters are. Their ends are first allowed to miss the next
+window at a price, which three rounds of Levenberg and Marquardt's iteration raise, and then made to meet by Gauss and
+Newton's. Where a rod is not seen, the windows are added a few at a time, each beginning where the motion fitted so far
+leads; for the first of them a grid of states of the hidden rod is tried.
+
+Only l2/l1, m2/m1 and g/l1 enter the angles, which is why one of l1, l2, g and one of m1, m2 are held.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dpend._runtime import require_float64
+from dpend.measurements import FEWEST, Angles, best_width, checked, local_cubics, wrapped
+from dpend.pendulum import Pendulum, Scalar, State, momenta, normal_modes
+from dpend.trajectory import Status, known_number
+from dpend.windows import (
+    PRICES,
+    ROUNDED,
+    Found,
+    Point,
+    Problem,
+    Settings,
+    descent,
+    ends_of,
+    fitted_angles,
+    laid_out,
+    misses_of,
+    refined,
+    run,
+    settings_for,
+    solved,
+    squared_price,
+)
+
+# How a free field moves the logarithms of l2/l1, m2/m1 and g/l1.
+_BY_FIELD = {"l1": (-1, 0, -1), "l2": (1, 0, 0), "m1": (0, -1, 0), "m2": (0, 1, 0), "g": (0, 0, 1)}
+RATIOS = ("l2/l1", "m2/m1", "g/l1")
+INITIAL = ("theta1", "theta2", "omega1", "omega2")
+
+
+# --- where it starts -------------------------------------------------------------------------------------------------
+
+
+class _Start(NamedTuple):
+    """What the data say of the nodes before anything is fitted."""
+
+    nodes: np.ndarray  # (4, K), zero where unknown
+    known: np.ndarray  # (2, K), of which rod's angle and velocity
+    noise: float
+
+
+# A cubic across spaces this many times the usual one, unless that is a small part of a swing, is not to be trusted.
+_WIDE, _SHORT = 3.5, 0.1
+
+
+def _smoothed(problem: Problem, times: np.ndarray, angles: np.ndarray, initial: tuple, rate: float) -> _Start:
+    """Nodes from local cubics through the samples about them, and from what is held."""
+    count = problem.times.size
+    nodes, known, variances = np.zeros((4, count)), np.zeros((2, count), bool), []
+    for rod, column in enumerate(angles):
+        there = np.isfinite(column)
+        if not np.any(there):
+            continue
+        when, values = times[there], np.unwrap(column[there])
+        half, noise = best_width(when, values)
+        cubics = local_cubics(when, values, problem.times, half)
+        spaces = np.diff(when)
+        widest = np.max(spaces[cubics.samples[:, :-1]], axis=1)
+        known[rod] = widest <= max(_WIDE * float(np.median(spaces)), _SHORT / rate)
+        known[rod] &= cubics.nearest <= widest  # beyond the first and the last sample a cubic knows nothing
+        nodes[rod], nodes[2 + rod] = cubics.value, cubics.slope
+        variances.append(noise**2)
+    known[:, 0] |= problem.held[:2] & problem.held[2:]
+    nodes[:, 0] = [node if value is None else value for node, value in zip(nodes[:, 0], initial, strict=True)]
+    return _Start(nodes, known, math.sqrt(float(np.mean(variances))))
+
+
+def _all_at_once(problem: Problem, start: _Start, settings: Settings, first: int) -> tuple[Point, int]:
+    """All nodes from the smoothed data, where nearly all are known."""
+    point, total = Point(start.nodes, np.zeros(problem.by_free.shape[1])), 0
+    for price in PRICES:
+        point, _, count = descent(problem, point, price, settings)
+        total += count
+    return point, total
+
+
+# This share of the nodes is known where all are tried at once: cubics through a gap may do, and if not it will be seen.
+_MOSTLY = 0.9
+
+# What is tried for a rod that nothing is known of: angles, and velocities [of the slow mode's rate] to either side;
+# how many of the best go on.
+_ANGLES, _VELOCITIES, _STARTS = 24, np.linspace(-4.5, 4.5, 13), 24
+# How many windows there are at first, tried in this order: some two thirds of a swing, of which fewer leave a hidden
+# rod free to go anywhere, and more are not led through by a wrong pendulum; and how many come at a time.
+_FIRST, _ADDED = (12, 16, 8), 4
+# Of many starts, this many are left after each addition, and none that costs so many times the best; all are given up
+# whose misses are, from a second swing on, so many times the noise.
+_LEFT, _WORSE, _LOST = (8, 5, 4, 3, 2, 2, 1), 30.0, 5.0
+# What was added is a wrong minimum if each of its angles costs more than this many times the noise's variance.
+_POOR = 3.0
+_WIDE_OPEN = (1.0, 0.3, 0.03)
+# The windows farther behind are left alone: what comes next depends on the last swings.
+_LOOKED_BACK = 64
+
+
+def _predicted(problem: Problem, start: _Start, point: Point, upto: int, settings: Settings) -> Point:
+    """The point with nodes up to `upto`: what is known of them from the data, the rest from the motion so far."""
+    nodes = list(point.nodes.T)
+    for k in range(len(nodes), upto):
+        here = problem._replace(dts=problem.dts[:, k - 1 : k])
+        _, ends = run(here, Point(nodes[-1][:, None], point.fields), settings.steps[0], ends_of)
+        nodes.append(np.where(np.tile(start.known[:, k], 2), start.nodes[:, k], ends[:, 0]))
+    return Point(np.stack(nodes, axis=1), point.fields)
+
+
+def _candidates(problem: Problem, start: _Start, settings: Settings, windows: int) -> list[Point]:
+    """First nodes: the known one, or those of a grid for a hidden rod that do better than their neighbours."""
+    fields = np.zeros(problem.by_free.shape[1])
+    if np.all(start.known[:, 0]):
+        return [Point(start.nodes[:, :1], fields)]
+    grid = np.meshgrid(np.arange(_ANGLES) * (2 * np.pi / _ANGLES), settings.rate * _VELOCITIES, indexing="ij")
+    nodes = np.repeat(start.nodes[:, :1], grid[0].size, axis=1)
+    hidden = int(np.argmin(start.known[:, 0]))
+    nodes[hidden], nodes[2 + hidden] = grid[0].ravel(), grid[1].ravel()
+    nodes = np.where(problem.held[:, None], start.nodes[:, :1], nodes)
+    first, cost = nodes, np.zeros(nodes.shape[1])
+    for k in range(min(windows, problem.times.size)):
+        here = problem._replace(dts=np.repeat(problem.dts[:, k : k + 1], nodes.shape[1], axis=1))
+        angles, nodes = run(here, Point(nodes, fields), settings.steps[0], ends_of)
+        missed = wrapped(np.moveaxis(angles, 1, 0) - problem.measured[..., k : k + 1])
+        cost += np.sum(np.where(problem.seen[..., k : k + 1], missed**2, 0.0), axis=(0, 1))
+    table = np.pad(
+        np.pad(cost.reshape(grid[0].shape), ((1, 1), (0, 0)), "wrap"), ((0, 0), (1, 1)), constant_values=np.inf
+    )
+    lowest = np.min(np.lib.stride_tricks.sliding_window_view(table, (3, 3)), axis=(2, 3)).ravel() >= cost
+    order = np.argsort(np.where(lowest, cost, np.inf))[: min(_STARTS, int(np.sum(lowest)))]
+    return [Point(first[:, i : i + 1], fields) for i in order]
+
+
+def _window_by_window(problem: Problem, start: _Start, settings: Settings, first: int) -> tuple[Point, int]:
+    """Each node where the motion fitted so far leads, from `first` windows on: for rods and times without data."""
+    points, total, upto, left = _candidates(problem, start, settings, first), 0, 0, list(_LEFT)
+    while upto < problem.times.size:
+        upto = min(upto + (_ADDED if upto else first), problem.times.size)
+        found = []
+        for point in points:
+            cost, after, count = _extended(problem, start, point, upto, settings, len(points) == 1)
+            total += count
+            found.append((cost, after))
+            if upto == first and cost < _POOR * settings.noise**2 * problem.part(0, upto).observations:
+                break  # wrong ones cost ten times as much
+        found.sort(key=lambda pair: pair[0])
+        points = [point for cost, point in found[: left.pop(0) if left else 1] if cost <= _WORSE * found[0][0]]
+        seen = problem.part(max(0, upto - _LOOKED_BACK), upto).observations
+        if not left and not found[0][0] < (_LOST * settings.noise) ** 2 * max(seen, 1):
+            return _predicted(problem, start, found[0][1], problem.times.size, settings), total
+    for price in PRICES[1:]:
+        points[0], _, count = descent(problem, points[0], price, settings)
+        total += count
+    return points[0], total
+
+
+def _extended(
+    problem: Problem, start: _Start, point: Point, upto: int, settings: Settings, alone: bool
+) -> tuple[float, Point, int]:
+    """The cost of the last windows up to `upto`, and the point with their nodes fitted.
+
+    What was added may have gone to a wrong minimum. Then, unless there are other starts, one window at a time does
+    better where a rod is hidden, and joints opened wide where the motion has come out of a gap in the data.
+    """
+    before = point.nodes.shape[1]
+    if before == 1 or not alone:
+        return _fitted_up_to(problem, start, point, upto, PRICES[before > 1 : 2], settings)
+    total, best = 0, (math.inf, math.inf, point)
+    for sizes, prices in (((upto,), PRICES[1:2]), (range(before + 1, upto + 1), PRICES[1:2]), ((upto,), _WIDE_OPEN)):
+        trial = point
+        for size in sizes:
+            cost, trial, count = _fitted_up_to(problem, start, trial, size, prices, settings)
+            total += count
+        added = _cost_of_last(problem, trial, upto - before, settings)
+        best = min(best, (added, cost, trial), key=lambda found: found[0])
+        if added < 1.0:
+            break
+    return best[1], best[2], total
+
+
+def _fitted_up_to(
+    problem: Problem, start: _Start, point: Point, upto: int, prices: tuple[float, ...], settings: Settings
+) -> tuple[float, Point, int]:
+    point = _predicted(problem, start, point, upto, settings)
+    behind = max(0, upto - _LOOKED_BACK)
+    part, total, cost = problem.part(behind, upto), 0, math.inf
+    recent = Point(point.nodes[:, behind:], point.fields)
+    for price in prices:
+        recent, cost, count = descent(part, recent, price, settings)
+        total += count
+    return cost, Point(np.hstack([point.nodes[:, :behind], recent.nodes]), recent.fields), total
+
+
+def _cost_of_last(problem: Problem, point: Point, count: int, settings: Settings) -> float:
+    """What the last windows and the joints before them cost, over what noise may make it."""
+    upto = point.nodes.shape[1]
+    behind = max(0, upto - count - 1)
+    part, recent = problem.part(behind, upto), Point(point.nodes[:, behind:], point.fields)
+    angles, ends = run(part, recent, settings.steps[0], ends_of)
+    cost = misses_of(part, recent.nodes, angles, ends).cost(squared_price(PRICES[1], settings.rate))
+    return cost / (_POOR * settings.noise**2 * (part.observations + 4))
+
+
+# --- what is known in the end ----------------------------------------------------------------------------------------
+
+# The fitted misses may be this many times what was expected, and as much more as chance makes of few; neighbouring
+# ones may be correlated so much; below so many radians they are what integration and rounding leave.
+_MORE_THAN_NOISE, _CORRELATED, _NO_NOISE = 1.5, 0.5, 1e-6
+
+
+class _Knowledge(NamedTuple):
+    covariance: np.ndarray  # of the fields' logarithms, then of the first node; infinite where nothing is known
+    ratios: np.ndarray  # (3,), standard errors of the logarithms of the ratios
+    determined: bool
+
+
+def _knowledge(problem: Problem, found: Found, settings: Settings, noise: float) -> _Knowledge:
+    """Covariances at the solution; what depends on an axis of the fields that the data do not determine is infinite."""
+    free, step = problem.by_free.shape[1], found.step
+    if step is None:
+        return _Knowledge(np.full((free + 4, free + 4), np.nan), np.full(3, np.nan), False)
+    weights, axes = np.linalg.eigh(step.information)
+    known = weights > max(settings.noise**2, ROUNDED * float(np.max(np.abs(weights), initial=0.0)))
+    errors = np.where(known, noise / np.sqrt(np.where(known, weights, 1.0)), np.inf)
+    loose = settings.rate * (problem.times[-1] - problem.times[0]) * errors > _PHASE
+    for j in np.flatnonzero(known & loose).tolist():
+        known[j] = _is_bounded(problem, found, settings, noise, min(_FAR_OFF * float(errors[j]), 1.0), axes, j)
+    inverse = (axes[:, known] / weights[known]) @ axes[:, known].T
+    moves = np.vstack([np.eye(free), step.response[:, :, 0].T])
+    covariance = moves @ inverse @ moves.T
+    covariance[free:, free:] += step.alone
+    covariance *= noise**2
+    deviations = np.sqrt(np.diag(covariance))
+    unknown = np.any(np.abs(moves @ axes[:, ~known]) > deviations[:, None], axis=1)
+    unknown[free : free + 2] |= deviations[free : free + 2] > 1.0
+    covariance[unknown], covariance[:, unknown] = np.nan, np.nan
+    covariance[unknown, unknown] = np.inf
+    ratios = np.sqrt(np.diag(problem.by_free @ inverse @ problem.by_free.T)) * noise
+    lost = np.any(np.abs(problem.by_free @ axes[:, ~known]) > ratios[:, None], axis=1)
+    return _Knowledge(covariance, np.where(lost, np.inf, ratios), not np.any(unknown))
+
+
+# A mode that is not excited is fitted to the noise, and its frequency comes out with a small formal error: a phase of
+# more than this [rad] over the data is worth a look. There, the sum of squares this many standard errors away, at most
+# a factor of e, must have grown by so many variances of the noise; no frequency in pure noise stands out by as much.
+_PHASE, _FAR_OFF, _GROWN = 0.3, 10.0, 30.0
+
+
+def _is_bounded(
+    problem: Problem, found: Found, settings: Settings, noise: float, far: float, axes: np.ndarray, j: int
+) -> bool:
+    """Whether the sum of squares has grown much `far` along an axis, to either side, where all else is fitted again."""
+    assert found.step is not None
+    others = np.delete(axes, j, axis=1)
+    for way in (far * axes[:, j], -far * axes[:, j]):
+        shifted = problem._replace(
+            logs=problem.logs + problem.by_free @ (found.point.fields + way), by_free=problem.by_free @ others
+        )
+        nodes = found.point.nodes + np.tensordot(way, found.step.response, 1)
+        aside = solved(shifted, Point(nodes, np.zeros(others.shape[1])), settings)
+        grown = (aside.misses.squares - found.misses.squares) / max(noise, 1e-300) ** 2
+        if aside.step is not None and grown < _GROWN:
+            return False
+    return True
+
+
+def _is_noise(residuals: np.ndarray, noise: float, expected: float, freedom: int) -> bool:
+    """Whether what is left of the data is as large as was expected, and not the same from sample to sample."""
+    if noise < _NO_NOISE:
+        return True
+    if noise > expected * (_MORE_THAN_NOISE + 3 / math.sqrt(freedom)):
+        return False
+    pairs = residuals[:, 1:] * residuals[:, :-1]
+    there = np.isfinite(pairs)
+    count = int(np.sum(there))
+    return float(np.sum(pairs[there])) <= (_CORRELATED * count + 3 * math.sqrt(count)) * noise**2
+
+
+def _status(problem: Problem, found: Found, determined: bool, noisy: bool, expected: float) -> Status:
+    """The verdict; also what keeps the iteration from closing the joints is a misfit where it was one before."""
+    if found.status != Status.CONVERGED:
+        far = found.misses.squares > problem.observations * (_MORE_THAN_NOISE * expected) ** 2
+        return Status.MISFIT if far and found.status == Status.MAX_ITERATIONS else found.status
+    return Status.MISFIT if not noisy else Status.CONVERGED if determined else Status.SINGULAR
+
+
+# --- what is asked ---------------------------------------------------------------------------------------------------
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Fit:
+    """A pendulum fitted to measured angles.
+
+    Attributes:
+        pendulum: with the estimated values of the free fields.
+        state: at the first time.
+        estimates: of the free fields [SI], of the ratios `l2/l1`, `m2/m1` and `g/l1` [1/s^2], and of the state at the
+            first time, `theta1`, `theta2` [rad], `omega1`, `omega2` [rad/s].
+        standard_errors: of the same, from the Jacobian of the constrained problem and the noise; 0 for what was held,
+            infinity for what the data do not determine, NaN where there was nothing to compute them from.
+        covariance: of the free fields, then of theta1, theta2, omega1, omega2, in this order, shape (n, n).
+        time: the times [s], shape (m,).
+        theta1, theta2: the fitted motion there [rad], continuous.
+        residual1, residual2: measured minus fitted, modulo full turns [rad]; NaN where nothing was measured.
+        noise: standard deviation of the measured angles about the fit [rad].
+        expected_noise: as given, or as local cubics through the data leave it [rad].
+        gap: the largest miss at a joint of two windows [rad, rad/s].
+        windows: how many there were.
+        iterations: how often the motion was linearised.
+        error_estimate: the largest change of a free field, relative, on going on at half the integration step.
+        status: a value of `Status`: `MISFIT` where the residuals are far above the expected noise or correlated,
+            `SINGULAR` where something asked for is not determined.
+        free: the names of the free fields.
+    """
+
+    pendulum: Pendulum
+    state: State
+    estimates: dict[str, Scalar]
+    standard_errors: dict[str, Scalar]
+    covariance: Scalar
+    time: Scalar
+    theta1: Scalar
+    theta2: Scalar
+    residual1: Scalar
+    residual2: Scalar
+    noise: Scalar
+    expected_noise: Scalar
+    gap: Scalar
+    windows: Scalar
+    iterations: Scalar
+    error_estimate: Scalar
+    status: Scalar
+    free: tuple[str, ...] = field(metadata={"static": True})
+
+
+def fit_parameters(
+    times: Any,
+    theta1: Any,
+    theta2: Any,
+    *,
+    pendulum: Any = None,
+    free: Any = ("l2", "m2", "g"),
+    initial: Any = (None, None, None, None),
+    noise: Any = None,
+) -> Fit:
+    """The pendulum, and the state at the first time, whose motion is nearest to measured angles.
+
+    Minimises the sum of squares of theta_model - theta_measured, modulo full turns, over both rods and all times; the
+    noise is taken to be independent, Gaussian and as large for both. Chaotic motions are no harder than calm ones:
+    `dpend.fit` tells how. Angles may be wrapped or not. Where one rod is not measured at all, its first angle and
+    velocity are sought on a grid.
+
+    Arguments:
+        times: increasing [s], shape (m,), in any spacing that shows the swings.
+        theta1, theta2: absolute angles [rad], shape (m,), NaN where nothing was measured; None for a rod never seen.
+            One of them is measured at the first time.
+        pendulum: the values of what is held, and where the search for the rest starts; the default `Pendulum()`.
+            Factors of two off are no trouble where both rods are seen, a third where only one is.
+        free: which of `l1`, `l2`, `m1`, `m2`, `g` to estimate. As only ratios enter, one of l1, l2, g and one of m1, m2
+            are held.
+        initial: theta1, theta2 [rad], omega1, omega2 [rad/s] at the first time, None where it is estimated;
+            (None, None, 0, 0) is a release from rest.
+        noise: standard deviation of the angles [rad], if it is known; the standard errors then rest on it, and
+            otherwise on the residuals.
+    Returns:
+        Fit; its `status` says whether it may be believed.
+    Raises:
+        ValueError: a free set with the overall length or mass in it, an unknown or repeated name; times that do not
+            increase or are too far apart; arrays of other lengths, infinite, with fewer than 7 angles of a rod, or with
+            fewer than there are unknowns; angles that look like degrees; nothing measured at the first time; noise or
+            initial values that are no such numbers; g zero and free.
+        RuntimeError: float64 is switched off in JAX.
+    """
+    require_float64()
+    pendulum = Pendulum() if pendulum is None else pendulum
+    if not isinstance(pendulum, Pendulum):
+        raise ValueError(f"pendulum must be a Pendulum, got {pendulum!r:.60}: give dpend.Pendulum(l1=...)")
+    names = _checked_free(free)
+    numbers = Pendulum(*(known_number(name, getattr(pendulum, name)) for name in _BY_FIELD))
+    if "g" in names and numbers.g == 0:
+        raise ValueError(
+            "g must not start at 0 where it is free, got 0: give its sign and size by a start above or below"
+        )
+    held = _checked_initial(initial)
+    sigma = None if noise is None else known_number("noise", noise, positive=True, unit="rad")
+    series = checked(times, theta1, theta2)
+    unknowns = len(names) + held.count(None)
+    count = int(np.sum(np.isfinite(series.values)))
+    if count < unknowns + FEWEST:
+        raise ValueError(f"times must be more for {unknowns} unknowns, got {count} angles: give {unknowns + FEWEST}")
+    with np.errstate(all="ignore"):  # what overflows is told by the status
+        return _fitted(series, numbers, names, held, sigma)
+
+
+def _checked_free(free: Any) -> tuple[str, ...]:
+    names = (free,) if isinstance(free, str) or not hasattr(free, "__iter__") else tuple(free)
+    for name in names:
+        if name not in tuple(_BY_FIELD) or names.count(name) > 1:
+            raise ValueError(
+                f"free must hold each of {', '.join(_BY_FIELD)} once at most, got {', '.join(map(str, names))}"
+            )
+    if {"l1", "l2", "g"} <= set(names):
+        raise ValueError("free must not hold l1, l2 and g: only l2/l1 and g/l1 enter the angles: fix one of l1, l2, g")
+    if {"m1", "m2"} <= set(names):
+        raise ValueError("free must not hold m1 and m2: only m2/m1 enters the angles: fix one of m1, m2")
+    return names
+
+
+def _checked_initial(initial: Any) -> tuple[float | None, ...]:
+    values = tuple(initial) if hasattr(initial, "__iter__") else (initial,)
+    if len(values) != len(INITIAL):
+        raise ValueError(
+            f"initial must be {', '.join(INITIAL)}, got {len(values)} values: give None for what is estimated"
+        )
+    return tuple(
+        None if value is None else known_number(f"initial {name}", value)
+        for name, value in zip(INITIAL, values, strict=True)
+    )
+
+
+def _fitted(
+    series: Angles, pendulum: Pendulum, free: tuple[str, ...], initial: tuple[float | None, ...], sigma: float | None
+) -> Fit:
+    rate = _rate(series, pendulum)
+    by_free = np.array([_BY_FIELD[name] for name in free], float).reshape(-1, 3).T
+    problem = laid_out(series, pendulum, by_free, np.array([value is not None for value in initial]), rate)
+    start = _smoothed(problem, *series, initial, rate)
+    expected = sigma or start.noise
+    seen_at_first = bool(np.all(start.known[:, 0]))
+    searches = [(_window_by_window, first) for first in (_FIRST[:1] if seen_at_first else _FIRST)]
+    if np.mean(np.all(start.known, axis=0)) > _MOSTLY:
+        searches.insert(0, (_all_at_once, 0))
+    total, fits = 0, []
+    for search, first in searches:
+        settings = settings_for(problem, start.nodes, start.known, rate, expected, np.zeros(len(free)))
+        point, count = search(problem, start, settings, first)
+        settings = settings_for(problem, point.nodes, np.ones_like(start.known), rate, expected, point.fields)
+        found, settings, change = refined(problem, solved(problem, point, settings), settings)
+        total += count + found.iterations
+        fits.append(_result(series, pendulum, free, problem, found, settings, sigma, change, total))
+        if found.step is not None and fits[-1].status in (Status.CONVERGED, Status.SINGULAR):
+            return fits[-1]
+    return min(fits, key=lambda fit: (fit.status != Status.MISFIT, np.nan_to_num(fit.noise, nan=np.inf)))
+
+
+def _rate(series: Angles, pendulum: Pendulum) -> float:
+    """What time is measured by [rad/s]: the slow mode, or rods that turn much faster."""
+    times, values = series
+    swing = (
+        float(normal_modes(pendulum)[0].frequency) if pendulum.g > 0 else math.sqrt(-float(pendulum.g / pendulum.l1))
+    )
+    turning = [
+        np.median(np.abs(wrapped(np.diff(column[there]))) / np.diff(times[there]))
+        for column in values
+        if np.any(there := np.isfinite(column))
+    ]
+    rate = max(swing, float(np.max(turning)) / _FASTER, 1 / (times[-1] - times[0]))
+    spacing = float(np.median(np.diff(times)))
+    if spacing * rate > _COARSEST:
+        raise ValueError(
+            f"times must be at most {_COARSEST / rate:.2g} s apart in the median to follow this pendulum, "
+            f"got {spacing:.3g} s: give seconds, more samples, or a pendulum nearer to it"
+        )
+    if (times[-1] - times[0]) * rate > _LONGEST:
+        raise ValueError(
+            f"times must last at most {_LONGEST / rate:.2g} s with this pendulum, got {times[-1] - times[0]:.3g} s: "
+            "give seconds, or fewer of them"
+        )
+    return rate
+
+
+# A chaotic motion's rods turn some times as fast as the slow mode, in the median: faster ones shorten the windows.
+_FASTER = 4.0
+# A quarter of a period between samples shows nothing of a swing; a million radians are a slip of the unit.
+_COARSEST, _LONGEST = math.pi / 2, 1e6
+
+
+def _result(
+    series: Angles,
+    pendulum: Pendulum,
+    free: tuple[str, ...],
+    problem: Problem,
+    found: Found,
+    settings: Settings,
+    sigma: float | None,
+    change: float,
+    iterations: int,
+) -> Fit:
+    fitted = fitted_angles(problem, found.point, settings.steps[1], series)
+    residuals = wrapped(series.values - fitted)
+    noise = math.sqrt(found.misses.squares / problem.freedom)
+    known = _knowledge(problem, found, settings, sigma or noise)
+    noisy = _is_noise(residuals, noise, settings.noise, problem.freedom)
+    factors = dict(zip(free, np.exp(found.point.fields), strict=True))
+    values = {name: np.float64(getattr(pendulum, name) * factors.get(name, 1.0)) for name in _BY_FIELD}
+    best = Pendulum(**{name: jnp.asarray(value) for name, value in values.items()})
+    node = found.point.nodes[:, 0]
+    ratios = np.array([values["l2"] / values["l1"], values["m2"] / values["m1"], values["g"] / values["l1"]])
+    scale = np.append([values[name] for name in free], np.ones(4))
+    covariance = known.covariance * np.outer(scale, scale)
+    errors = np.sqrt(np.diag(covariance))
+    names = (*free, *RATIOS, *INITIAL)
+    estimates = np.concatenate([scale[: len(free)], ratios, node])
+    deviations = np.concatenate([errors[: len(free)], known.ratios * np.abs(ratios), errors[len(free) :]])
+    return Fit(
+        pendulum=best,
+        state=State(*(jnp.asarray(leaf) for leaf in jax.tree.leaves(momenta(best, *(jnp.asarray(x) for x in node))))),
+        estimates=dict(zip(names, estimates, strict=True)),
+        standard_errors=dict(zip(names, deviations, strict=True)),
+        covariance=covariance,
+        time=series.times,
+        theta1=fitted[0],
+        theta2=fitted[1],
+        residual1=residuals[0],
+        residual2=residuals[1],
+        noise=np.float64(noise),
+        expected_noise=np.float64(settings.noise),
+        gap=np.float64(np.max(np.abs(found.misses.joints), initial=0.0)),
+        windows=np.asarray(problem.times.size),
+        iterations=np.asarray(iterations),
+        error_estimate=np.float64(change),
+        status=np.asarray(int(_status(problem, found, known.determined, noisy, settings.noise))),
+        free=free,
+    )
