@@ -630,7 +630,7 @@ class Scheme:
 
 # The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th percentile over
 # 64 x 64 releases from rest on the whole square, after 2 s of the paper's pendulum, nearly two periods of its slow mode
-# (experiments/sweep_speed.py). At no error was another method faster.
+# (experiments/speed_vs_error.py). At no error was another method faster.
 _ERROR_OF_STEP = {
     "rk8-circle-rescaled": (
         (0.17, 1.3e-9),

@@ -436,13 +436,12 @@ def _saved(pendulum, state, dt, steps, scheme, save_every, room):  # type: ignor
     return jnp.asarray(at, jnp.float64) * dt, State(*rows.T), carry[1]
 
 
-def _simulated(pendulum, state, duration, steps, scheme, save_every, room, error, wanted, drift_tolerance):  # type: ignore[no-untyped-def]
+def _simulated(pendulum, state, duration, steps, scheme, save_every, room, estimate, wanted, drift_tolerance):  # type: ignore[no-untyped-def]
     dt = step_size(duration, steps)
     state, turns = _without_turns(state)
     time, states, rate = _saved(pendulum, state, dt, steps, scheme, save_every, room)
     drift = _drift(pendulum, states)
-    estimate = jnp.asarray(jnp.nan)
-    if error:
+    if estimate is None:
         _, finer, _ = _saved(pendulum, _a_rounding_away(state), dt / 2, 2 * steps, scheme, 2 * save_every, room)
         estimate = _angle_error(states, finer) / (1 - 2.0**-scheme.order) + _last_place(turns)
     states = _with_turns(states, turns)
@@ -455,8 +454,8 @@ def _simulated(pendulum, state, duration, steps, scheme, save_every, room, error
     return Trajectory(time, states, drift, estimate, jnp.asarray(steps), status, scheme)
 
 
-_simulate = jax.jit(_simulated, static_argnames=("steps", "scheme", "save_every", "room", "error"))
-_simulate_traced = jax.jit(_simulated, static_argnames=("scheme", "room", "error"))
+_simulate = jax.jit(_simulated, static_argnames=("steps", "scheme", "save_every", "room"))
+_simulate_traced = jax.jit(_simulated, static_argnames=("scheme", "room"))
 
 
 # Rounding errors of a whole motion are some 30 units in the last place of its start, magnified as such a displacement
@@ -515,7 +514,8 @@ def simulate(
         tolerance: wanted error of the angles [rad] at the worst time; 1e-9 if neither it nor a step is given. If no
             step reaches it, because the motion is chaotic and too long, the status is `BEYOND_HORIZON`.
         save_every: every how many steps a state is saved; the last state always is.
-        error: make the second pass at half the step. Without it `error_estimate` is NaN, at a third of the time.
+        error: make the second pass at half the step. Without it `error_estimate` is NaN, at a third of the time. For a
+            tolerance the search has made it: the estimate is the worst at any step, saved or not.
         drift_tolerance: largest energy drift, in units of the energy scale, that passes. By default 1e-6 for a step,
             far above what a method loses at a sensible one; for a tolerance any, the error itself being known.
     Returns:
@@ -542,11 +542,12 @@ def simulate(
         raise ValueError(f"method must take even steps to save states at, got {method!r}: give rk8-circle, or use flow")
     state = _float64(state)
     wanted = np.float64(_PARTED)
+    estimate: float | None  # None is made by the second pass
     if step is None:
         wanted = number("tolerance", 1e-9 if tolerance is None else tolerance, positive=True, unit="rad")
-        scheme = _scheme_reaching(pendulum, state, known, method, wanted)
+        scheme, estimate = _scheme_reaching(pendulum, state, known, method, wanted)
     else:
-        scheme = Scheme(method, step)
+        scheme, estimate = Scheme(method, step), None if error else math.nan
     steps = scheme.steps(known)
     if steps // save_every > _MOST_SAVED:
         raise ValueError(
@@ -556,13 +557,13 @@ def simulate(
     every = min(int(save_every), steps)
     time = jnp.asarray(duration, jnp.float64)
     if step is not None:
-        return _simulate(pendulum, state, time, steps, scheme, every, None, error, wanted, drift_tolerance)
+        return _simulate(pendulum, state, time, steps, scheme, every, None, estimate, wanted, drift_tolerance)
     # The number of steps being this motion's own, a program that were compiled for it would be used once.
     rows = 1 + -(-steps // every)
     room = max(_LEAST_ROOM, 1 << (rows - 1).bit_length())
     counts = jnp.asarray(steps), jnp.asarray(every)
     motion = _simulate_traced(
-        pendulum, state, time, counts[0], _any_step(scheme), counts[1], room, error, wanted, drift_tolerance
+        pendulum, state, time, counts[0], _any_step(scheme), counts[1], room, estimate, wanted, drift_tolerance
     )
     time, states = jax.tree.map(lambda rows_: jnp.asarray(np.asarray(rows_)[:rows]), (motion.time, motion.state))
     return replace(motion, time=time, state=states, scheme=scheme)
@@ -576,11 +577,14 @@ _FIRST_TURN = 0.5
 _ONLY_ROUNDING = 1e-18
 
 
-def _scheme_reaching(pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float) -> Scheme:
-    """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding allows."""
-    rate = float(jnp.maximum(fast_frequency(pendulum), _fastest(pendulum, state)))
+def _scheme_reaching(
+    pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float
+) -> tuple[Scheme, float]:
+    """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding allows,
+    and that error."""
+    rate = float(_fastest_of_all(pendulum, state))
     if not math.isfinite(rate):
-        return Scheme(method, abs(duration))  # whatever the step, the status will say so
+        return Scheme(method, abs(duration)), math.nan  # whatever the step, the status will say so
     steps = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN))
     if steps > _MOST_SAVED:
         raise ValueError(
@@ -591,9 +595,15 @@ def _scheme_reaching(pendulum: Pendulum, state: State, duration: float, method: 
         scheme = Scheme(method, abs(duration) / steps)
         error = float(_error_of(pendulum, state, step_size(duration, steps), jnp.asarray(steps), _any_step(scheme)))
         if error <= tolerance or (rate * scheme.step) ** scheme.order < _ONLY_ROUNDING:
-            return scheme
+            return scheme, error
         missing = (2 * error / tolerance) ** (1 / scheme.order) if math.isfinite(error) else 4.0
         steps = math.ceil(steps * min(max(missing, 1.2), 4.0))
+
+
+@jax.jit
+def _fastest_of_all(pendulum: Pendulum, state: State) -> Scalar:
+    """What a step has to resolve at the start [rad/s]."""
+    return jnp.maximum(fast_frequency(pendulum), _fastest(pendulum, state))
 
 
 def _any_step(scheme: Scheme) -> Scheme:

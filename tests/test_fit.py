@@ -106,6 +106,7 @@ def test_data_without_noise_give_every_digit(paper, chaos):
     assert max(abs(float(fit.state.p1)), abs(float(fit.state.p2))) < 1e-10
 
 
+@pytest.mark.slow
 def test_other_pendulums_at_irregular_times():
     pendulum = Pendulum(0.3, 0.15, 0.2, 0.05, 9.81)
     places = np.cumsum(np.random.default_rng(1).integers(2, 30, 301))
@@ -132,6 +133,7 @@ def test_a_release_from_rest_tells_more(paper, chaos):
     assert fit.standard_errors["theta2"] < 0.1 * plain.standard_errors["theta2"]
 
 
+@pytest.mark.slow
 def test_least_squares_by_scipy_agree():
     """Swings of 1 s, shot at in one piece with DOP853 and the equations of motion written by hand."""
     pendulum, times = Pendulum(), np.linspace(0.0, 1.0, 61)
@@ -254,6 +256,7 @@ def test_a_pendulum_at_rest_tells_nothing():
     assert all(still.standard_errors[name] == np.inf for name in ("l2", "m2", "g"))
 
 
+@pytest.mark.slow
 def test_one_mode_does_not_tell_all_three(paper):
     """Small swings of one mode have a frequency and a ratio of angles: two numbers for three."""
     slow = dpend.normal_modes(paper)[0]

@@ -83,6 +83,7 @@ def test_a_chaotic_motion_is_believed_up_to_its_horizon(paper, duration, status)
     assert (check.horizon.horizon < duration) == (status == Status.BEYOND_HORIZON)
 
 
+@pytest.mark.slow
 def test_the_horizon_of_the_papers_chaotic_motion(paper):
     """A coarse step loses; the growth is the motion's own, whatever the step."""
     state = dpend.released(*CHAOTIC)

@@ -154,7 +154,7 @@ def test_small_swings_are_the_normal_modes(paper):
         # l2/l1, m2/m1 and where the in-phase branch turns back, and turns again [deg].
         pytest.param((1.0, 0.1), (17.77, 5.43), marks=pytest.mark.slow),
         pytest.param((1.0, 0.01), (3.07, 0.60), marks=pytest.mark.slow),
-        ((10.0, 1.0), (46.57, 24.30)),
+        pytest.param((10.0, 1.0), (46.57, 24.30), marks=pytest.mark.slow),
     ],
 )
 def test_a_branch_that_turns_is_followed_through_its_turns(pendulum, angles):

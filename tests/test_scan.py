@@ -48,7 +48,7 @@ def test_the_returns_of_forty_degrees(paper):
         (1e-3, 2.0),
         (65, 2.0),
         pytest.param(100, 3.0, marks=pytest.mark.slow),
-        (142.03125, 3.0),
+        pytest.param(142.03125, 3.0, marks=pytest.mark.slow),
         (175.78125, 2.0),
         (180, 2.0),
     ],
@@ -75,6 +75,7 @@ def test_momenta_vanish_at_every_return(paper):
         np.testing.assert_allclose([last.p1[0] / unit, last.p2[0] / unit], 0, atol=2e-2)
 
 
+@pytest.mark.slow
 def test_two_returns_meet_where_a_family_turns_back(paper):
     """A family's fold in theta1: two returns on one side of it, at a distance like the root of the angle, none on the
     other. Near it cells are long in time, and intervals alone could be halved for ever."""

@@ -191,6 +191,7 @@ def test_scheme_for_a_tolerance(paper):
         dpend.scheme_for(paper, 0.0)
 
 
+@pytest.mark.slow
 def test_gauss_is_symplectic_and_its_own_inverse(paper):
     """Whatever the step: M^T J M = J for the derivative of the step's map, which no explicit method here satisfies, and
     a step back returns to the last bits."""

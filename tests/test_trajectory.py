@@ -155,7 +155,6 @@ def test_what_went_wrong_is_a_status(paper):
     assert status(paper, State(jnp.nan * jnp.ones(()), 0.0, 0.0, 0.0), 1.0, step=0.01) == Status.NONFINITE
     assert status(paper, State(jnp.nan * jnp.ones(()), 0.0, 0.0, 0.0), 1.0) == Status.NONFINITE
     chaotic = dpend.released(np.radians(170), np.pi)
-    assert status(paper, chaotic, 20.0, step=1e-3) == Status.BEYOND_HORIZON
     assert status(paper, chaotic, 20.0, tolerance=1e-6) == Status.BEYOND_HORIZON
     assert status(paper, RELEASE, 1.0, step=5e-3, error=False) == Status.CONVERGED
     assert len({dpend.message(member) for member in Status}) == len(Status)
