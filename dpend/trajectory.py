@@ -521,8 +521,9 @@ def simulate(
     Returns:
         Trajectory.
     Raises:
-        ValueError: duration zero or not finite, both step and tolerance given, a step not positive or longer than the
-            motion, an unknown method, save_every below 1, more than 1e8 states to save.
+        ValueError: duration zero or not finite, both step and tolerance given, no step where the state or the pendulum
+            is traced, a step not positive or longer than the motion, an unknown method, save_every below 1, more than
+            1e8 states to save.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -544,7 +545,9 @@ def simulate(
     wanted = np.float64(_PARTED)
     estimate: float | None  # None is made by the second pass
     if step is None:
-        wanted = number("tolerance", 1e-9 if tolerance is None else tolerance, positive=True, unit="rad")
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, state))):
+            raise ValueError("tolerance needs a state and a pendulum that are known, got traced ones: give a step")
+        wanted = _MARGIN * number("tolerance", 1e-9 if tolerance is None else tolerance, positive=True, unit="rad")
         scheme, estimate = _scheme_reaching(pendulum, state, known, method, wanted)
     else:
         scheme, estimate = Scheme(method, step), None if error else math.nan
@@ -571,6 +574,8 @@ def simulate(
 
 # Rows of the smallest table that a motion of unknown length is saved in; larger ones double.
 _LEAST_ROOM = 1024
+# The share of a tolerance that an estimate may reach: it may itself be off by a tenth.
+_MARGIN = 0.8
 # The first step that is tried when one is sought [rad of the fastest motion at the start].
 _FIRST_TURN = 0.5
 # Below (rate dt)^p of this the truncation of a step is lost in rounding: a smaller step only adds to that.
