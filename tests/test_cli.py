@@ -51,6 +51,7 @@ def test_both_partners_of_forty_degrees(capsys):
     assert abs(inner["energy_J"] - expected) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_design(capsys):
     command = ("design", "--branch", "in-phase", "--theta1", 60, "--period", 1.0, "--free", "l1,l2")
     status, found = run_json(capsys, *command)
@@ -326,6 +327,7 @@ def test_the_program_itself(tmp_path):
     assert refused.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_family_as_json_and_csv(capsys, tmp_path):
     status, found = run_json(capsys, "family", "--branch", "anti-phase")
     assert (status, found["status"], found["ends"]) == (0, "converged", ["normal mode", "homoclinic"])

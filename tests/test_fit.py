@@ -270,6 +270,7 @@ def test_one_mode_does_not_tell_all_three(paper):
     assert abs(held.estimates["g"] - 9.8) < 3 * held.standard_errors["g"] < 0.05
 
 
+@pytest.mark.slow
 def test_a_wrong_pendulum_is_not_believed(paper, chaos):
     """Gravity held 8 % off."""
     data = noisy(chaos, 0)[:, :240]

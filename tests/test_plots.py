@@ -59,6 +59,7 @@ def test_orbit_sheet_shows_whole_orbits(paper):
     assert "elliptic" in angles.get_title()
 
 
+@pytest.mark.slow
 def test_a_map_shows_its_cells_and_the_line_no_flip_crosses(paper):
     side = np.pi * (np.arange(10) + 0.5 - 5) / 5
     field = dpend.sweep(partial(dpend.chaos.flip, duration=1.0), paper, {"theta1": side, "theta2": side})

@@ -51,6 +51,7 @@ def test_a_running_jax_is_left_alone():
     assert "import dpend before JAX" in error
 
 
+@pytest.mark.slow
 def test_the_users_own_settings_stand():
     flags = "--xla_cpu_enable_fast_min_max=false"
     assert run(REPORT, JAX_NUM_CPU_DEVICES="3", XLA_FLAGS=flags) == [True, 3, flags, None]

@@ -88,6 +88,7 @@ def test_tiles_and_axes_do_not_change_a_bit(paper, flips, monkeypatch):
         np.testing.assert_array_equal(flips[key], turned[key].T)
 
 
+@pytest.mark.slow
 def test_axes_of_the_pendulum(paper):
     """The Hamiltonian's own scaling: period and all times go with sqrt(l) when both lengths grow."""
     gravity = np.array([9.8, 4.9])

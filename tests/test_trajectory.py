@@ -181,6 +181,7 @@ def test_a_tolerance_holds_on_the_whole_square(paper, duration, tolerance):
     assert passed >= (85 if duration == 2.0 else 60)
 
 
+@pytest.mark.slow
 def test_a_tolerance_of_a_thousandth_is_met(paper):
     """Energy may drift more than a fixed step is allowed to; the estimate knows the error."""
     release = dpend.released(2.0, -1.0)
