@@ -33,6 +33,7 @@ def test_the_eight_orbits_of_forty_degrees(forty):
     assert (seen.suspicious_cells, seen.slices, seen.refinements, seen.degree) == (0, 1, 2, seen.winding)
 
 
+@pytest.mark.slow
 def test_every_row_is_an_orbit(forty, paper):
     """At rest at its dual after half the period and back after the whole, by diffrax; kappa by the whole monodromy; all
     as well as kappa allows."""

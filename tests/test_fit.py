@@ -246,6 +246,7 @@ def test_masses_lengths_frames_and_noise(pendulum, release, every, noise):
 # --- what cannot be known, and what is not so ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_pendulum_at_rest_tells_nothing():
     data = noisy(np.zeros((2, 151)), 0, noise=1e-3)
     fit = fit_parameters(FRAMES[:151], *data, pendulum=off(Pendulum()))

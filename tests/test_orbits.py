@@ -175,6 +175,7 @@ def test_a_branch_that_turns_is_followed_through_its_turns(pendulum, angles):
         assert beyond.status in (Status.NO_SUCH_ORBIT, Status.LEFT_BRANCH)
 
 
+@pytest.mark.slow
 def test_no_such_orbit_says_how_far_the_branch_reaches(paper):
     orbit = dpend.find_orbit(paper, np.radians(181), branch="in-phase", error=False)
     assert orbit.status == Status.NO_SUCH_ORBIT
@@ -195,6 +196,7 @@ def test_failures_are_statuses(paper):
         assert abs(trivial.theta2 - np.pi) < 1e-6
 
 
+@pytest.mark.slow
 def test_everything_traces(paper):
     angles = jnp.radians(jnp.array([20.0, -90.0, 150.0]))
     many = jax.jit(jax.vmap(partial(dpend.find_orbit, paper, branch="anti-phase", error=False)))(angles)

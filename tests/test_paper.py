@@ -85,6 +85,7 @@ KNOWN = {
 TOLERANCES = {"deg": 1e-10, "s": 6e-4, "J": 6e-5, "1/s": 6e-3}
 
 
+@pytest.mark.slow
 def test_somersaults_to_the_printed_digit():
     """The nine times of the paper, by 3.14 and RK4: theta1 through pi, and local maxima of PE2."""
     motion = numbers.chaos_of("as printed")

@@ -38,6 +38,7 @@ def test_import_sets_up_float64_and_a_device_a_core():
     assert run(REPORT) == [True, _runtime._cores(), None, None]
 
 
+@pytest.mark.slow
 def test_plain_jax_is_left_alone():
     x64, devices, flags, error = run(REPORT, DPEND_PLAIN_JAX="1")
     assert (x64, devices, flags) == (False, 1, None)

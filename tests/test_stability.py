@@ -52,6 +52,7 @@ def test_quarter_half_and_whole_period_agree(orbits):
         np.testing.assert_allclose(routes, routes[0], rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_monodromy_has_the_flow_as_an_eigenvector_and_powers_for_covers(orbits):
     for orbit in orbits[:2]:
         period = float(orbit.period)
