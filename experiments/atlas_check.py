@@ -27,6 +27,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from extended import accelerations
 
 jax.config.update("jax_enable_x64", True)
 HERE = Path(__file__).parent
@@ -39,27 +40,10 @@ VERTICAL, AT_REST = 1e-7, 1e-6
 NUMBERS = "theta1_deg theta2_deg dual_theta1_deg dual_theta2_deg period_s energy_J kappa turns1 turns2".split()
 
 
-def accelerate(pendulum, time, state):
-    """The slope of (theta1, theta2, omega1, omega2): Lagrange's two equations, by Cramer's rule.
-
-    (m1 + m2) l1 a1 + m2 l2 c a2 = -m2 l2 s omega2^2 - (m1 + m2) g sin theta1
-              l1 c a1 +    l2 a2 =     l1 s omega1^2 -           g sin theta2,   c, s of theta1 - theta2
-    """
-    l1, l2, m1, m2, g = pendulum
-    theta1, theta2, omega1, omega2 = state
-    c, s = jnp.cos(theta1 - theta2), jnp.sin(theta1 - theta2)
-    right1 = -m2 * l2 * s * omega2**2 - (m1 + m2) * g * jnp.sin(theta1)
-    right2 = l1 * s * omega1**2 - g * jnp.sin(theta2)
-    size = (m1 + m2) - m2 * c * c
-    a1 = (right1 - m2 * c * right2) / (l1 * size)
-    a2 = ((m1 + m2) * right2 - c * right1) / (l2 * size)
-    return jnp.stack([omega1, omega2, a1, a2])
-
-
 def slope(pendulum, time, pair):
     """That of a state and of the matrix of its derivatives."""
     state, matrix = pair
-    forward = jax.linearize(partial(accelerate, pendulum, time), state)
+    forward = jax.linearize(partial(accelerations, pendulum, numpy=jnp), state)
     return forward[0], jax.vmap(forward[1], -1, -1)(matrix)
 
 

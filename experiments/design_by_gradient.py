@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from extended import accelerations
 from jax import lax
 
 import dpend
@@ -45,19 +46,6 @@ def designs(start: dpend.Pendulum, angles: np.ndarray) -> list[dpend.Design]:
 # --- the check: diffrax and Lagrange's equations ---------------------------------------------------------------------
 
 
-def lagrange(time, x, parameters):  # type: ignore[no-untyped-def]
-    """Angular accelerations from M(delta) theta'' = -coupling terms - weights."""
-    l1, l2, m1, m2, g = parameters
-    theta1, theta2, omega1, omega2 = x
-    cosine, sine = jnp.cos(theta1 - theta2), jnp.sin(theta1 - theta2)
-    matrix = jnp.array([[(m1 + m2) * l1, m2 * l2 * cosine], [l1 * cosine, l2]])
-    right = jnp.array([
-        -m2 * l2 * omega2**2 * sine - (m1 + m2) * g * jnp.sin(theta1),
-        l1 * omega1**2 * sine - g * jnp.sin(theta2),
-    ])  # fmt: skip
-    return jnp.concatenate([jnp.array([omega1, omega2]), jnp.linalg.solve(matrix, right)])
-
-
 @jax.jit
 def missed(parameters: jax.Array, angles: jax.Array, period: jax.Array) -> jax.Array:
     """By how much a release is not back at rest after the period [rad, and rad per radian of the fast mode]."""
@@ -65,7 +53,7 @@ def missed(parameters: jax.Array, angles: jax.Array, period: jax.Array) -> jax.A
 
     start = jnp.concatenate([angles, jnp.zeros(2)])
     end = diffrax.diffeqsolve(
-        diffrax.ODETerm(lagrange),
+        diffrax.ODETerm(lambda t, x, pendulum: accelerations(pendulum, x, jnp)),
         diffrax.Dopri8(),
         t0=0.0,
         t1=period,

@@ -26,8 +26,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+import extended
 
 HERE = Path(__file__).parent
 FIRST, LAST = 0.02, 3.1  # [rad]
@@ -366,28 +369,10 @@ def shot(theta1: Any, theta2: Any, time: Any, steps: int, columns: int = 8) -> A
     import numpy as np
 
     x, step = np.stack([theta1, theta2, 0 * theta1, 0 * theta1]), time / steps
+    slope = partial(extended.accelerations, np.ones(5, np.longdouble))
     for _ in range(steps):
-        start = lagrange(x)
-        row: list = []
-        for k in range(1, columns + 1):
-            dt = step / (2 * k)
-            before, now = x, x + dt * start
-            for _ in range(2 * k - 1):
-                before, now = now, before + 2 * dt * lagrange(now)
-            last, row = row, [(now + before + dt * lagrange(now)) / 2]
-            for j, coarser in enumerate(last):
-                row.append(row[j] + (row[j] - coarser) / ((np.longdouble(k) / (k - 1 - j)) ** 2 - 1))
-        x = row[-1]
+        x = next(islice(extended.extrapolated(slope, x, step), columns - 1, None))
     return x
-
-
-def lagrange(x: Any) -> Any:
-    """Velocities and accelerations of l1 = l2 = m1 = m2 = g = 1."""
-    import numpy as np
-
-    s, c = np.sin(x[0] - x[1]), np.cos(x[0] - x[1])
-    upper, lower = -s * x[3] ** 2 - 2 * np.sin(x[0]), s * x[2] ** 2 - np.sin(x[1])
-    return np.stack([x[2], x[3], (upper - c * lower) / (2 - c * c), (2 * lower - c * upper) / (2 - c * c)])
 
 
 if __name__ == "__main__":
