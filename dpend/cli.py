@@ -219,6 +219,8 @@ def design(
     """The pendulum nearest to this one whose orbit released at THETA1 has a wanted period, stability, or both."""
     start = Pendulum(l1, l2, m1, m2, g)
     equations, branches = _asked(branch, period, kappa, ratio)
+    if not 0 < number("theta1", theta1, unit="deg") < 180:
+        raise ValueError(f"theta1 must be between 0 and 180 deg, got {theta1:g}: give another theta1")
 
     def loss(*orbits: PeriodicOrbit) -> Any:
         by_name = dict(zip(branches, orbits, strict=True))
