@@ -202,9 +202,7 @@ def _linear(problem: Problem, point: Point, steps: int, prior: float = 0.0) -> _
 class _Step(NamedTuple):
     nodes: np.ndarray
     fields: np.ndarray
-    information: (
-        np.ndarray
-    )  # of the fields, nodes eliminated: the inverse of their covariance over the noise's variance
+    information: np.ndarray  # of the fields, nodes eliminated: inverse of their covariance over the noise's variance
     response: np.ndarray  # (F, 4, K), of the nodes to the fields
     alone: np.ndarray  # (4, 4), covariance of the first node with the fields held, over the noise's variance
 
