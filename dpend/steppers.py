@@ -10,8 +10,8 @@ point that a step moves is not always a `State`. There are two forms:
 
 `gauss` is implicit, of order 6 and symplectic: the energy error does not grow with time, but for a part that vanishes
 exponentially with the step (the paper's orbit at 40 degrees loses 2e-14 of its energy a period with 40 steps in it,
-1e-17 with 60). Its point is a canonical state with the rounding errors of all sums so far, which the next sum takes
-back.
+1e-17 with 60), and one of 2e-18 to 1e-17 a period whose cause is not known. Its point is a canonical state with the
+rounding errors of all sums so far, which the next sum takes back.
 
 The rescaled method takes equal steps in a time s of its own, dt/ds = u^(-5/8) with u = 1 + 0.85 q/omega_f^2,
 q = omega1^2 + omega2^2 + (omega1 - omega2)^2 and omega_f the fast normal mode's frequency: short in t where the rods

@@ -511,8 +511,9 @@ def simulate(
         step: largest step [s]. Without it the step is chosen for `tolerance`.
         method: any with even steps. The default is `rk8` for a step, which needs ten times fewer evaluations than `rk4`
             at an error of 1e-9, and `rk8-circle` for a tolerance: no other is faster at any error below 1e-3.
-        tolerance: wanted error of the angles [rad] at the worst time; 1e-9 if neither it nor a step is given. If no
-            step reaches it, because the motion is chaotic and too long, the status is `BEYOND_HORIZON`.
+        tolerance: wanted error of the angles [rad] at the worst time; 1e-9 if neither it nor a step is given. The
+            estimate is brought below 0.8 of it. If no step does that, because the motion is chaotic and too long, the
+            status is `BEYOND_HORIZON`.
         save_every: every how many steps a state is saved; the last state always is.
         error: make the second pass at half the step. Without it `error_estimate` is NaN, at a third of the time. For a
             tolerance the search has made it: the estimate is the worst at any step, saved or not.
@@ -586,7 +587,8 @@ def _scheme_reaching(
     pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float
 ) -> tuple[Scheme, float]:
     """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding allows,
-    and that error."""
+    and that error.
+    """
     rate = float(_fastest_of_all(pendulum, state))
     if not math.isfinite(rate):
         return Scheme(method, abs(duration)), math.nan  # whatever the step, the status will say so
