@@ -10,9 +10,10 @@ Every function takes leaves of any one shape, so grids of states and of pendulum
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -41,12 +42,41 @@ def number(name: str, value: Scalar, *, positive: bool = False, unit: str = "") 
     return np.float64(value)
 
 
-@jax.tree_util.register_dataclass
+Tree = TypeVar("Tree")
+
+
+def _register(cls: type[Tree]) -> type[Tree]:
+    """Make a dataclass whose constructor checks its numbers a JAX tree of its fields.
+
+    Libraries rebuild trees from leaves that are no numbers: masks, `None`, text, shapes, differences of lengths. So
+    unflattening fills the fields and never runs a check: any leaf passes. `register_dataclass` calls the constructor.
+    """
+    names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+    keys = [jax.tree_util.GetAttrKey(name) for name in names]
+
+    def flatten(tree: Tree) -> tuple[list[Any], None]:
+        return [getattr(tree, name) for name in names], None
+
+    def flatten_with_keys(tree: Tree) -> tuple[list[tuple[Any, Any]], None]:
+        return list(zip(keys, flatten(tree)[0], strict=True)), None
+
+    def unflatten(_: None, leaves: Iterable[Any]) -> Tree:
+        tree = object.__new__(cls)
+        for name, leaf in zip(names, leaves, strict=True):
+            object.__setattr__(tree, name, leaf)
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
+
+
+@_register
 @dataclass(frozen=True)
 class Pendulum:
     """The parameters of a double pendulum; bob 1 hangs from the pivot, bob 2 from bob 1.
 
-    The defaults are those of Yamaguchi's paper. Python numbers become float64 and are checked.
+    The defaults are those of Yamaguchi's paper. Whoever constructs one by hand has Python numbers checked and made
+    float64. Unflattening never runs checks: any leaf passes.
 
     Attributes:
         l1, l2: lengths of the rods [m], positive.
@@ -70,10 +100,13 @@ class Pendulum:
         object.__setattr__(self, "g", number("g", self.g, unit="m/s^2"))
 
 
-@jax.tree_util.register_dataclass
+@_register
 @dataclass(frozen=True)
 class State:
     """A point of phase space, or many of one shape.
+
+    Whoever constructs one by hand has Python numbers checked and made float64. Unflattening never runs checks: any leaf
+    passes.
 
     Attributes:
         theta1, theta2: absolute angles from the downward vertical [rad], never wrapped.
