@@ -12,7 +12,7 @@ has the sign that it takes when it leaves; what is still on its way there at the
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -56,22 +56,33 @@ class Crossing(NamedTuple):
     steps: Scalar
 
 
-class _Step(NamedTuple):
-    """A step to look into: the state before it, its end and length [s], and of each function the sign at its start and
-    whether it changes.
+class _Start(NamedTuple):
+    """A function at a step's start: its sign, its value, its change over the step at the rate
+    there; and whether the step changes its sign.
     """
+
+    sign: Scalar
+    value: Scalar
+    change: Scalar
+    crossed: Scalar
+
+
+class _Step(NamedTuple):
+    """A step to look into: the state before it, its end and length [s], and every function."""
 
     before: State
     time: Scalar
     dt: Scalar
-    signs: tuple[Scalar, ...]
-    crossed: tuple[Scalar, ...]
+    starts: tuple[_Start, ...]
 
 
 class _Search(NamedTuple):
-    """What is known along the way. `values`, `rates` [1/s] and `signs` are those of the functions after the last step,
-    a sign zero as long as there is none; scalars, not arrays, which XLA would not compute side by side for many lanes.
-    `closed` tells that the last of the steps to look into changes a sign, so that no later one is asked for.
+    """What is known along the way.
+
+    `values`, `rates` [1/s] and `signs` are those of the functions after the last step; a sign is
+    zero as long as there is none. They are scalars: XLA computes those of many lanes side by side,
+    and arrays of a few numbers not. `closed`: the last of the slots changes a sign, so that no later
+    step is asked for.
     """
 
     values: tuple[Scalar, ...]
@@ -85,11 +96,55 @@ class _Search(NamedTuple):
 
 
 class _Pass(NamedTuple):
-    """What one motion from start to end has found. Steps up to `floor` [s] are known to hold nothing."""
+    """What one motion from start to end finds. Steps up to `floor` [s] are known to hold nothing."""
 
     floor: Scalar
     again: Scalar
     crossing: Crossing
+
+
+class _Task(NamedTuple):
+    """A function to follow in a step, and the phase in which that begins."""
+
+    index: Scalar
+    phase: Scalar
+    before: State
+    time: Scalar
+    dt: Scalar
+    start: _Start
+
+
+# What a probe does next: see whether it is at zero before the step, try the step's end, look for a
+# turn, close in on a root, judge it; or it is done.
+_ARRIVE, _END, _TURN, _ROOT, _LAST, _FOUND, _NONE = range(7)
+
+
+class _Sample(NamedTuple):
+    """A function inside a step: where [steps], its value, its change over a step at that rate."""
+
+    share: Scalar
+    value: Scalar
+    change: Scalar
+
+
+class _Probe(NamedTuple):
+    """One function inside one step.
+
+    It has `sign` at `low` and, in the phase of the root, the other one at `high`; `share` is what is
+    tried next, `last` the length of the last move, `largest` the larger value at the step's ends.
+    """
+
+    phase: Scalar
+    share: Scalar
+    low: _Sample
+    high: _Sample
+    sign: Scalar
+    last: Scalar
+    largest: Scalar
+    count: Scalar
+
+    def between(self, phase: Scalar, low: _Sample, high: _Sample) -> "_Probe":
+        return self._replace(phase=jnp.asarray(phase), low=low, high=high, last=high.share - low.share)
 
 
 def first_crossing(
@@ -140,18 +195,33 @@ def _first_crossing(functions, pendulum, state, duration, scheme, direction):  #
 
     def attempt(last: _Pass) -> _Pass:
         search = fold(partial(watch.look, last.floor), start, pendulum, state, duration, scheme)
-        end = watch.end(search, duration, step)
-        slots = jax.tree.map(lambda *leaves: jnp.stack(leaves), *search.slots)
-        found, _ = lax.scan(watch.settle, end._replace(which=jnp.full_like(end.which, -1)), slots)
-        some = found.which >= 0
-        # Only where the slots hold all that there was to look into is the search at its end.
-        again = ~some & (search.closed | (search.count == _SLOTS))
-        floor = jnp.max(jnp.where(jnp.arange(_SLOTS) < search.count, jnp.abs(slots.time), 0.0))
-        return _Pass(floor, again, _choose(some, found, end))
+        # Where the slots do not hold all that there is to look into, a further pass may be needed.
+        more = search.closed | (search.count == _SLOTS)
+        none = Crossing(last.crossing.time + jnp.inf, search.state, jnp.asarray(-1), search.steps)
+        tasks = _tasks(search, more, duration, step)
+        crossing, _ = lax.scan(partial(watch.settle, duration), none, tasks)
+        times = [jnp.where(search.count > i, jnp.abs(slot.time), 0.0) for i, slot in enumerate(search.slots)]
+        return _Pass(jnp.max(jnp.stack(times)), more & (crossing.which < 0), crossing)
 
-    none = Crossing(jnp.full_like(state.theta1, jnp.inf), state, jnp.asarray(-1), jnp.zeros_like(state.theta1))
-    first = _Pass(jnp.zeros_like(state.theta1), jnp.isinf(none.time), none)
+    zero = jnp.zeros_like(state.theta1)
+    first = _Pass(zero, zero == 0, Crossing(zero, state, jnp.asarray(-1), zero))
     return lax.while_loop(lambda last: last.again, attempt, first).crossing
+
+
+def _tasks(search: _Search, more: Scalar, duration: float, step: float) -> _Task:
+    """All functions in the steps to look into, then all in the step that begins at the end."""
+    tasks = []
+    for slot in search.slots:
+        for index, start in enumerate(slot.starts):
+            phase = jnp.where((start.sign != 0) & (slot.dt != 0), _END, _NONE)
+            tasks.append(_Task(jnp.asarray(index), phase, slot.before, slot.time, slot.dt, start))
+    functions = zip(search.signs, search.values, search.rates, strict=True)
+    for index, (sign, value, rate) in enumerate(functions):
+        phase = jnp.where(more | (sign == 0), _NONE, _ARRIVE)
+        start = _Start(sign, value, rate * step, sign > 2)
+        beyond = jnp.asarray(duration + step), jnp.asarray(step)
+        tasks.append(_Task(jnp.asarray(index), phase, search.state, *beyond, start))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
 
 
 def _choose(condition: Scalar, this: Any, other: Any) -> Any:
@@ -159,8 +229,8 @@ def _choose(condition: Scalar, this: Any, other: Any) -> Any:
 
 
 class _Measure(NamedTuple):
-    """The functions at a state, shape (functions,): values, changes over one whole step at the rate there, and what
-    rounding leaves uncertain of the values.
+    """The functions at a state, shape (functions,): values, changes over one whole step at the rate
+    there, and what rounding leaves uncertain of the values.
     """
 
     value: jax.Array
@@ -180,113 +250,96 @@ class _Watch(NamedTuple):
         leaves = jax.tree.leaves(self.functions(self.pendulum, state))
         return tuple(jnp.asarray(leaf, jnp.float64) for leaf in leaves)
 
-    def rates(self, state: State) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
-        """The functions and their rates of change along the motion [1/s]."""
-        return jax.jvp(self.values, (state,), (vector_field(self.pendulum, state),))
-
     def measure(self, state: State, dt: Scalar) -> _Measure:
         """The functions against a step of `dt` [s]."""
-        parts = [
-            jnp.stack(values) for values in zip(*(jax.tree.leaves(x) for x in self._gradients(state)), strict=True)
-        ]
-        moves = [dt * slope for slope in jax.tree.leaves(vector_field(self.pendulum, state))]
-        change = sum(part * move for part, move in zip(parts, moves, strict=True))
-        sizes = [jnp.abs(x) + jnp.abs(move) for x, move in zip(jax.tree.leaves(state), moves, strict=True)]
-        rounding = _EPSILON * sum(jnp.abs(part) * size for part, size in zip(parts, sizes, strict=True))
-        return _Measure(jnp.stack(self.values(state)), change, rounding)
-
-    def _gradients(self, state: State) -> tuple[State, ...]:
-        return jax.jacfwd(self.values)(state)
+        gradients = [jnp.stack(jax.tree.leaves(row)) for row in jax.jacfwd(self.values)(state)]
+        table = jnp.stack(gradients)  # functions, leaves of the state
+        move = dt * jnp.stack(jax.tree.leaves(vector_field(self.pendulum, state)))
+        size = jnp.abs(jnp.stack(jax.tree.leaves(state))) + jnp.abs(move)
+        rounding = _EPSILON * jnp.sum(jnp.abs(table) * size, axis=1)
+        return _Measure(jnp.stack(self.values(state)), jnp.sum(table * move, axis=1), rounding)
 
     def counts(self, sign: Scalar) -> Scalar:
         """Whether a change from this sign is one that is asked for."""
         return sign != 0 if self.direction == 0 else sign * self.direction < 0
 
     def start(self, state: State, step: float) -> _Search:
-        """The search at its start. What lies on zero has the sign of the first derivative that is not zero."""
-        values, rates = self.rates(state)
-        _, (_, bends) = jax.jvp(self.rates, (state,), (vector_field(self.pendulum, state),))
-        zeros = _ROUNDING * self.measure(state, step).rounding
-        terms = zip(values, rates, bends, zeros, strict=True)
-        signs = tuple(_first_sign((value, step * rate, step**2 * bend), zero) for value, rate, bend, zero in terms)
-        zero = jnp.zeros_like(state.theta1)
-        slot = _Step(state, zero, zero, signs, tuple(sign > 2 for sign in signs))
-        return _Search(values, rates, signs, state, (slot,) * _SLOTS, jnp.asarray(0), zero > 0, zero)
+        """The search at its start. What lies on zero has the sign of its rate."""
+        here = self.measure(state, step)
+        zero = _ROUNDING * here.rounding
+        leaves = jnp.where(jnp.abs(here.change) > zero, jnp.sign(here.change), 0.0)
+        table = jnp.where(jnp.abs(here.value) > zero, jnp.sign(here.value), leaves)
+        values, rates, signs = tuple(here.value), tuple(here.change / step), tuple(table)
+        nothing = jnp.zeros_like(state.theta1)
+        starts = tuple(_Start(sign, nothing, nothing, sign > 2) for sign in signs)
+        slots = (_Step(state, nothing, nothing, starts),) * _SLOTS
+        return _Search(values, rates, signs, state, slots, jnp.asarray(0), nothing > 0, nothing)
 
     def look(self, floor: Scalar, search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
         """The `update` of `fold` that notes the steps to look into."""
-        values, rates = self.rates(state)
-        befores = [_Sample(0.0, value, dt * rate) for value, rate in zip(search.values, search.rates, strict=True)]
-        afters = [_Sample(1.0, value, dt * rate) for value, rate in zip(values, rates, strict=True)]
-        ends = list(zip(search.signs, befores, afters, strict=True))
-        crossed = tuple(_goes_through(sign, after) for sign, _, after in ends)
-        wanted = [through & self.counts(sign) for through, sign in zip(crossed, search.signs, strict=True)]
-        changes = jnp.any(jnp.stack(wanted))
-        turns = jnp.any(jnp.stack([_may_dip(*end) for end in ends]))
-        take = (changes | turns) & ~search.closed & (search.count < _SLOTS) & (jnp.abs(time) > floor)
-        step = _Step(search.state, time, dt, search.signs, crossed)
+        values, rates = jax.jvp(self.values, (state,), (vector_field(self.pendulum, state),))
+        starts, changes, turns = [], [], []
+        both = zip(search.signs, search.values, search.rates, values, rates, strict=True)
+        for sign, before, rate_before, value, rate in both:
+            after = _Sample(1.0, value, dt * rate)
+            crossed, change = _goes_through(sign, after), dt * rate_before
+            starts.append(_Start(sign, before, change, crossed))
+            changes.append(crossed & self.counts(sign))
+            turns.append(_may_dip(sign, _Sample(0.0, before, change), after))
+        closes = reduce(jnp.logical_or, changes)
+        wanted = (closes | reduce(jnp.logical_or, turns)) & (jnp.abs(time) > floor)
+        take = wanted & ~search.closed & (search.count < _SLOTS)
+        step = _Step(search.state, time, dt, tuple(starts))
         slots = tuple(_choose(take & (search.count == i), step, slot) for i, slot in enumerate(search.slots))
-        signs = tuple(_sign_after(*both) for both in zip(search.signs, crossed, values, strict=True))
-        count, closed = search.count + take.astype(int), search.closed | (take & changes)
+        signs = tuple(_sign_after(start, value) for start, value in zip(starts, values, strict=True))
+        count, closed = search.count + take.astype(int), search.closed | (take & closes)
         return _Search(values, rates, signs, state, slots, count, closed, search.steps + 1.0)
 
-    def end(self, search: _Search, duration: float, step: float) -> Crossing:
-        """The end of the motion as a crossing, if it lies on zero and comes from the side asked for."""
-        here, sign = self.measure(search.state, step), jnp.stack(search.signs)
-        zero = _ROUNDING * here.rounding
-        arrives = (jnp.abs(here.value) <= zero) & (sign * here.change < -zero) & self.counts(sign)
-        some = jnp.any(arrives)
-        time, which = jnp.where(some, duration, jnp.inf), jnp.where(some, jnp.argmax(arrives), -1)
-        return Crossing(time, search.state, which, search.steps)
-
-    def settle(self, crossing: Crossing, step: _Step) -> tuple[Crossing, None]:
-        """The earliest crossing inside the step, unless there is one already."""
-        begin, signs = self.measure(step.before, step.dt), jnp.stack(step.signs)
-        asked = (crossing.which < 0) & (step.dt != 0)
-        each = jnp.arange(len(signs)), begin, signs, jnp.stack(step.crossed)
-        # One after the other, not `vmap`: lanes then stay side by side.
-        share, state, found = lax.map(lambda one: self._probe(step, asked, *one), each)
-        which = jnp.argmin(jnp.where(found, share, jnp.inf))
-        share, state = jax.tree.map(lambda leaf: leaf[which], (share, state))
-        time = step.time + (share - 1.0) * step.dt
-        here = Crossing(time, state, which, crossing.steps)
-        return _choose(jnp.any(found), here, crossing), None
-
-    def _probe(self, step, asked, index, begin, sign, crossed):  # type: ignore[no-untyped-def]
-        """Where in the step function `index` crosses [steps], the state there, and whether it does."""
-        unit, point = self.scheme.constants(self.pendulum), self.scheme.enter(self.pendulum, step.before)
-
-        def at(share: Scalar) -> tuple[State, _Measure]:
-            state = self.scheme.leave(unit, self.scheme.move(self.scheme.lasting(unit, share * step.dt), point))
-            measure = self.measure(state, step.dt)
-            return state, jax.tree.map(lambda leaf: leaf[index], measure)
+    def settle(self, duration: float, crossing: Crossing, task: _Task) -> tuple[Crossing, None]:
+        """The crossing of a task, if it is earlier than the one known."""
+        unit = self.scheme.constants(self.pendulum)
+        point = self.scheme.enter(self.pendulum, task.before)
 
         def once(carry: tuple[_Probe, State]) -> tuple[_Probe, State]:
             probe, _ = carry
-            state, measure = at(probe.share)
+            state = self.scheme.leave(unit, self.scheme.move(self.scheme.lasting(unit, probe.share * task.dt), point))
+            measure = jax.tree.map(lambda leaf: leaf[task.index], self.measure(state, task.dt))
             here = _Sample(probe.share, measure.value, measure.change)
-            phases = (
-                (_END, self._enclosed(probe, here, crossed)),
-                (_TURN, self._descended(probe, here, measure.rounding)),
-                (_ROOT, _narrowed(probe, here, measure.rounding)),
-            )
-            ahead = _judged(probe, here, measure.rounding)
-            for phase, other in phases:
-                ahead = _choose(probe.phase == phase, other, ahead)
-            return ahead._replace(count=probe.count + 1), state
+            return self._follow(probe, here, measure.rounding, task.start.crossed), state
 
         def goes_on(carry: tuple[_Probe, State]) -> Scalar:
             return (carry[0].phase < _FOUND) & (carry[0].count < _MOST_ITERATIONS)
 
-        low = _Sample(jnp.zeros_like(begin.value), begin.value, begin.change)
-        phase = jnp.where(asked & (sign != 0), _END, _NONE)
-        largest = jnp.maximum(jnp.abs(begin.value), begin.rounding)
-        one = jnp.ones_like(begin.value)
-        first = _Probe(phase, one, low, low, sign, one, largest, jnp.asarray(0))
-        probe, state = lax.while_loop(goes_on, once, (first, step.before))
-        return probe.share, state, probe.phase == _FOUND
+        early = jnp.abs(task.time - task.dt) < jnp.abs(crossing.time)
+        first = _first_probe(task)._replace(phase=jnp.where(early, task.phase, _NONE))
+        probe, state = lax.while_loop(goes_on, once, (first, task.before))
+        time = task.time + (probe.share - 1.0) * task.dt
+        nearest = jnp.sign(duration) * jnp.minimum(jnp.abs(time), abs(duration))
+        time = time + lax.stop_gradient(nearest - time)
+        earlier = (probe.phase == _FOUND) & (jnp.abs(time) < jnp.abs(crossing.time))
+        return _choose(earlier, Crossing(time, state, task.index, crossing.steps), crossing), None
 
-    def _enclosed(self, probe: "_Probe", here: "_Sample", crossed: Scalar) -> "_Probe":
+    def _follow(self, probe: _Probe, here: _Sample, rounding: Scalar, crossed: Scalar) -> _Probe:
+        """The probe after one more try, which is `here`."""
+        phases = {
+            _ARRIVE: self._arrived(probe, here, rounding),
+            _END: self._enclosed(probe, here, crossed),
+            _TURN: self._descended(probe, here, rounding),
+            _ROOT: _narrowed(probe, here, rounding),
+        }
+        ahead = _judged(probe, here, rounding)
+        for phase, other in phases.items():
+            ahead = _choose(probe.phase == phase, other, ahead)
+        return ahead._replace(count=probe.count + 1)
+
+    def _arrived(self, probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
+        """At the end of the motion: the root that is there, within rounding."""
+        zero = _ROUNDING * rounding
+        arrives = (jnp.abs(here.value) <= zero) & (probe.sign * here.change < -zero) & self.counts(probe.sign)
+        share = here.share - here.value / jnp.where(arrives, here.change, 1.0)
+        return probe._replace(phase=jnp.where(arrives, _LAST, _NONE), share=share)
+
+    def _enclosed(self, probe: _Probe, here: _Sample, crossed: Scalar) -> _Probe:
         """After the step's end: a bracket of a change of sign, or of a turn before one, or the end of it."""
         largest = jnp.maximum(probe.largest, jnp.abs(here.value))
         probe = probe._replace(largest=largest)
@@ -301,7 +354,7 @@ class _Watch(NamedTuple):
         root = root._replace(share=_inverse(root.low, root.high))
         return _choose(_goes_through(probe.sign, here), root, ahead)
 
-    def _descended(self, probe: "_Probe", here: "_Sample", rounding: Scalar) -> "_Probe":
+    def _descended(self, probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
         """On the way to where a function turns back: a bracket as soon as it is through zero by more than rounding, or
         the end of it where the slope and the bracket's width leave too little to fall.
         """
@@ -323,34 +376,12 @@ class _Watch(NamedTuple):
         return _choose(height < -rounding, root, ahead)
 
 
-# What a probe does next: try the step's end, look for a turn, close in on a root, judge it; or it is done.
-_END, _TURN, _ROOT, _LAST, _FOUND, _NONE = range(6)
-
-
-class _Sample(NamedTuple):
-    """A function inside a step: where [steps], its value, and its change over a step at the rate there."""
-
-    share: Scalar
-    value: Scalar
-    change: Scalar
-
-
-class _Probe(NamedTuple):
-    """One function inside one step. It has `sign` at `low` and, in the phase of the root, the other one at `high`;
-    `share` is what is tried next, `last` the length of the last move, `largest` the larger value at the step's ends.
-    """
-
-    phase: Scalar
-    share: Scalar
-    low: _Sample
-    high: _Sample
-    sign: Scalar
-    last: Scalar
-    largest: Scalar
-    count: Scalar
-
-    def between(self, phase: Scalar, low: _Sample, high: _Sample) -> "_Probe":
-        return self._replace(phase=jnp.asarray(phase), low=low, high=high, last=high.share - low.share)
+def _first_probe(task: _Task) -> _Probe:
+    start = task.start
+    low = _Sample(jnp.zeros_like(start.value), start.value, start.change)
+    share = jnp.where(task.phase == _END, jnp.ones_like(start.value), 0.0)
+    largest = jnp.maximum(jnp.abs(start.value), _EPSILON * jnp.abs(start.change))
+    return _Probe(task.phase, share, low, low, start.sign, jnp.ones_like(share), largest, jnp.asarray(0))
 
 
 def _narrowed(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
@@ -383,22 +414,14 @@ def _judged(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
     return probe._replace(phase=jnp.where(small, _FOUND, _NONE))
 
 
-def _first_sign(terms: tuple[Scalar, ...], zero: Scalar) -> Scalar:
-    """The sign of the first term that is larger than zero; none, zero."""
-    sign = jnp.zeros_like(terms[0])
-    for term in reversed(terms):
-        sign = jnp.where(jnp.abs(term) > zero, jnp.sign(term), sign)
-    return sign
-
-
 def _goes_through(sign: Scalar, after: _Sample) -> Scalar:
     """Whether the sign has changed; at zero itself the slope tells."""
     return (sign * after.value < 0) | ((after.value == 0) & (sign * after.change < 0))
 
 
-def _sign_after(sign: Scalar, crossed: Scalar, value: Scalar) -> Scalar:
+def _sign_after(start: _Start, value: Scalar) -> Scalar:
     """A function that is not a number loses its sign: what it does next is a new start."""
-    kept = jnp.where(crossed, -sign, sign)
+    kept = jnp.where(start.crossed, -start.sign, start.sign)
     return jnp.where(jnp.isnan(value), 0.0, jnp.where(value == 0, kept, jnp.sign(value)))
 
 
