@@ -34,6 +34,8 @@ _ROUNDING = 8.0
 # this share of the difference of its slopes at the step's ends; a swing is as deep there as 1/8. Its
 # error is some (omega h)/2 of that for a swing of frequency omega: it is seen up to omega h = 0.8.
 _MARGIN, _BESIDE = 0.05, 0.3
+# A rise so many times the slopes at both ends of a bracket and at the root is a jump.
+_STEEPEST = 4.0
 # So near the end of a motion [steps] a crossing is asked whether it lies at the end within rounding.
 _NEAR_END = 1e-3
 # A step that crosses in the motion and not when taken again (the circle forms then begin on their circle) is lengthened
@@ -72,7 +74,8 @@ class _Search(NamedTuple):
     """What is known along the way.
 
     `values` and `signs` are those of the functions after the last step, of `dt`, and `rates` [1/s]
-    their mean ones in it; a sign is zero as long as there is none. They are scalars: XLA computes
+    their mean ones in it; a sign is zero as long as there is none, that is until a value is larger than
+    `zeros`, its rounding at the start. They are scalars: XLA computes
     those of many lanes side by side, and arrays of a few numbers not. `step` is the first one to look
     into, once `taken`.
     """
@@ -80,6 +83,7 @@ class _Search(NamedTuple):
     values: tuple[Scalar, ...]
     rates: tuple[Scalar, ...]
     signs: tuple[Scalar, ...]
+    zeros: tuple[Scalar, ...]
     dt: Scalar
     state: State
     step: _Step
@@ -267,22 +271,25 @@ class _Watch(NamedTuple):
 
     def start(self, state: State, step: float) -> _Search:
         """The search at its start. What lies on zero has the sign of its rate."""
-        values, rates, signs = [], [], []
+        values, rates, signs, zeros = [], [], [], []
         for here in self.measure(state, step):
             zero = _ROUNDING * here.rounding
-            leaves = jnp.where(jnp.abs(here.change) > zero, jnp.sign(here.change), 0.0)
+            leaves = _sign_beyond(zero, here.change)
             signs.append(jnp.where(jnp.abs(here.value) > zero, jnp.sign(here.value), leaves))
             values.append(here.value)
             rates.append(here.change / step)
+            zeros.append(zero)
         nothing = jnp.zeros_like(state.theta1)
         before = _Step(state, nothing, nothing, (nothing,) * len(signs))
-        return _Search(tuple(values), tuple(rates), tuple(signs), nothing, state, before, nothing > 0, nothing)
+        functions = tuple(values), tuple(rates), tuple(signs), tuple(zeros)
+        return _Search(*functions, nothing, state, before, nothing > 0, nothing)
 
     def look(self, floor: Scalar, search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
         """The `update` of `fold` that notes the steps to look into."""
         values, mean = self.values(state), dt / (search.dt + dt)
         marks, rates, signs = [], [], []
-        for sign, before, rate, value in zip(search.signs, search.values, search.rates, values, strict=True):
+        befores = search.signs, search.values, search.rates, search.zeros
+        for sign, before, rate, zero, value in zip(*befores, values, strict=True):
             move = value - before
             # What the parabola adds to its chord's slope at the end, and takes from it at the start.
             bend = mean * (move - dt * rate)
@@ -290,11 +297,13 @@ class _Watch(NamedTuple):
             turns = _may_turn(sign * before, sign * value, sign * bend)
             marks.append(jnp.where(crossed & self.counts(sign), 2 * sign, jnp.where(turns, sign, 0.0)))
             rates.append(move / dt)
-            signs.append(_sign_after(jnp.where(crossed, -sign, sign), value))
+            signs.append(jnp.where(sign == 0, _sign_beyond(zero, value), _sign_after(sign, crossed, value)))
         wanted = reduce(jnp.logical_or, [mark != 0 for mark in marks]) & (jnp.abs(time) > floor)
         take = wanted & ~search.taken
         step = _choose(take, _Step(search.state, time, dt, tuple(marks)), search.step)
-        return _Search(values, tuple(rates), tuple(signs), dt, state, step, search.taken | take, search.steps + 1.0)
+        return _Search(
+            values, tuple(rates), tuple(signs), search.zeros, dt, state, step, search.taken | take, search.steps + 1.0
+        )
 
     def settle(self, tasks: list[_Task], none: Crossing, duration: float) -> Crossing:
         """The earliest crossing of all tasks. Each lane goes through its own, one after the other."""
@@ -346,7 +355,7 @@ class _Watch(NamedTuple):
         zero = _ROUNDING * rounding
         arrives = (jnp.abs(here.value) <= zero) & (probe.sign * here.change < -zero) & self.counts(probe.sign)
         share = here.share - here.value / jnp.where(arrives, here.change, 1.0)
-        return probe._replace(phase=jnp.where(arrives, _LAST, _NONE), share=share, largest=zero)
+        return probe._replace(phase=jnp.where(arrives, _LAST, _NONE), share=share, largest=jnp.full_like(zero, jnp.inf))
 
     def _enclosed(self, probe: _Probe, here: _Sample, crossed: Scalar) -> _Probe:
         """After the step's end: a bracket of a change of sign, or of a turn before one, or the end of it."""
@@ -428,10 +437,16 @@ def _narrowed(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
 
 
 def _judged(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
-    """Whether it is a root: as small as rounding, and smaller than at the ends of the step, which a pole is not."""
-    small = jnp.abs(here.value) <= _ROUNDING * (rounding + _EPSILON * jnp.abs(here.change))
-    small &= jnp.abs(here.value) <= probe.largest
-    return probe._replace(phase=jnp.where(small, _FOUND, _NONE))
+    """Whether it is a root: as small as rounding, where the function is larger elsewhere in the step, which rounding
+    alone is not, but not smaller, which it is beside a pole; and no jump, that is a rise which no slope explains.
+    """
+    low, high = probe.low, probe.high
+    slopes = jnp.abs(low.change) + jnp.abs(high.change) + jnp.abs(here.change)
+    rise = jnp.abs(high.value - low.value)
+    is_root = jnp.abs(here.value) <= _ROUNDING * (rounding + _EPSILON * jnp.abs(here.change))
+    is_root &= (jnp.abs(here.value) <= probe.largest) & (probe.largest > _ROUNDING * rounding)
+    is_root &= rise <= _STEEPEST * slopes * (high.share - low.share) + _ROUNDING * rounding
+    return probe._replace(phase=jnp.where(is_root, _FOUND, _NONE))
 
 
 def _goes_through(sign: Scalar, after: _Sample) -> Scalar:
@@ -439,11 +454,16 @@ def _goes_through(sign: Scalar, after: _Sample) -> Scalar:
     return (sign * after.value < 0) | ((after.value == 0) & (sign * after.change < 0))
 
 
-def _sign_after(sign: Scalar, value: Scalar) -> Scalar:
-    """The sign of `value`, at zero the one given. A function that is not a number loses its sign: what it does next is
-    a new start.
+def _sign_beyond(zero: Scalar, value: Scalar) -> Scalar:
+    return jnp.where(jnp.abs(value) > zero, jnp.sign(value), 0.0)
+
+
+def _sign_after(sign: Scalar, crossed: Scalar, value: Scalar) -> Scalar:
+    """The sign after a step, also where that ends at zero. A function that is not a number loses its sign: what it does
+    next is a new start.
     """
-    return jnp.where(jnp.isnan(value), 0.0, jnp.where(value == 0, sign, jnp.sign(value)))
+    kept = jnp.where(crossed, -sign, sign)
+    return jnp.where(jnp.isnan(value), 0.0, jnp.where(value == 0, kept, jnp.sign(value)))
 
 
 def _may_turn(start: Scalar, end: Scalar, bend: Scalar) -> Scalar:
