@@ -7,12 +7,13 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dpend.checks import file_path, function, instance, known_number, shown
 from dpend.files import check_place, replacing
-from dpend.pendulum import Pendulum, State, fast_frequency, number, positions
+from dpend.pendulum import Pendulum, State, check_motion, check_pendulum, fast_frequency, positions
 from dpend.plots import LOWER, UPPER
 from dpend.trajectory import Trajectory, simulate
 
@@ -38,7 +39,7 @@ _MOST_STEPS = 1e7
 
 
 def motions_for(
-    pendulum: Pendulum, releases: Sequence[State], duration: float, *, speed: float = 1.0
+    pendulum: Pendulum | Any, releases: Sequence[State] | Any, duration: float | Any, *, speed: float | Any = 1.0
 ) -> list[Trajectory]:
     """The motions from `releases`, saved four times a frame.
 
@@ -51,8 +52,12 @@ def motions_for(
         ValueError: duration or speed not positive; a speed at which the motion does not last for a frame; more than
             10 000 frames, or 1e7 steps.
     """
-    interval = float(number("speed", speed, positive=True)) / FRAMES_PER_SECOND
-    duration = float(number("duration", duration, positive=True, unit="s"))
+    if not isinstance(releases, Sequence):
+        raise ValueError(f"releases must be a sequence of states, got {shown(releases)}: give one like [state]")
+    for release in releases:
+        check_motion(pendulum, release)
+    interval = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
+    duration = known_number("duration", duration, positive=True, unit="s")
     if not interval <= duration:
         raise ValueError(f"speed must show the motion of {duration:g} s for a frame at least, got {speed:g}: lower it")
     count = duration / interval if interval > 0 else math.inf
@@ -73,11 +78,11 @@ def motions_for(
 
 
 def film(
-    pendulum: Pendulum,
-    motions: Sequence[Trajectory],
-    out: Path,
+    pendulum: Pendulum | Any,
+    motions: Sequence[Trajectory] | Any,
+    out: Path | Any,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | Any | None = None,
 ) -> int:
     """Draws motions with common, equally spaced times into `out`; returns the number of frames.
 
@@ -89,15 +94,24 @@ def film(
         ValueError: another suffix, no such directory, no motions, or motions with different times.
         RuntimeError: .mp4 without imageio-ffmpeg.
     """
+    out = file_path("out", out)
     check_out(out)
+    check_pendulum(pendulum)
+    if not isinstance(motions, Sequence):
+        raise ValueError(f"motions must be a sequence of trajectories, got {shown(motions)}: see motions_for")
+    for motion in motions:
+        instance("motions", motion, Trajectory, "a list of them, see motions_for")
+    if progress is not None:
+        function("progress", progress, "(frames done, frames in all)", "print")
     if not motions or not all(np.array_equal(motion.time, motions[0].time) for motion in motions):
         raise ValueError(f"motions must be at least one, saved at the same times, got {len(motions)}: see motions_for")
     with replacing(out) as draft:
         return _WRITERS[out.suffix](pendulum, motions, draft, progress or (lambda done, total: None))
 
 
-def check_out(out: Path) -> None:
+def check_out(out: Path | Any) -> None:
     """Refuses, before anything is computed, what `film` could not write; raises as it does."""
+    out = file_path("out", out)
     check_place("out", out, tuple(_WRITERS))
     if out.suffix == ".mp4":
         _encoder()

@@ -11,20 +11,19 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.families import known_pendulum
+from dpend.checks import file_path, known_number, known_real, one_of, several, shown
 from dpend.files import check_place, json_text, replacing
-from dpend.orbits import SYMMETRIES, PeriodicOrbit, find_orbit
+from dpend.orbits import SYMMETRIES, PeriodicOrbit, find_orbit, swinging_pendulum
 from dpend.pendulum import Pendulum, released
 from dpend.scan import Scan, Zero, longest, scanned
 from dpend.shooting import natural
-from dpend.trajectory import Status, known_number
+from dpend.trajectory import Status
 
 # Intervals of theta2 that a scan begins with, and how often they are doubled at most.
 _INTERVALS, _MOST_REFINEMENTS = 128, 6
@@ -92,9 +91,9 @@ class Atlas:
     def where(
         self,
         *,
-        period: Sequence[Any] | None = None,
-        energy: Sequence[Any] | None = None,
-        kappa: Sequence[Any] | None = None,
+        period: Sequence[Any] | Any | None = None,
+        energy: Sequence[Any] | Any | None = None,
+        kappa: Sequence[Any] | Any | None = None,
         symmetry: Any = None,
         family: Any = None,
     ) -> "Atlas":
@@ -111,10 +110,8 @@ class Atlas:
         names = {one["family"] for one in self.families}
         for name, wanted, known in (("symmetry", symmetry, set(SYMMETRIES)), ("family", family, names)):
             if wanted is not None:
-                chosen = list(wanted) if isinstance(wanted, (list, tuple, set)) else [wanted]
-                for one in chosen:
-                    if one not in known:
-                        raise ValueError(f"{name} must be one of {', '.join(sorted(known)) or 'none'}, got {one!r}")
+                given = list(wanted) if isinstance(wanted, (list, tuple, set)) else [wanted]
+                chosen = [one_of(name, one, sorted(known)) for one in given]
                 keep &= np.isin(self.table[name], chosen)
         return replace(self, table={key: column[keep] for key, column in self.table.items()})
 
@@ -128,7 +125,7 @@ class Atlas:
             row["turns"] = [row.pop("turns1"), row.pop("turns2")]
         return {**self._about(), "orbits": rows}
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str] | Any) -> None:
         """Writes F.json, or F.csv whose first line is a comment with all but the table, to be read by `load_atlas`.
 
         Angles in degrees, which may cost their last bit, everything else as it is. How many digits of theta2 and the
@@ -137,7 +134,7 @@ class Atlas:
         Raises:
             ValueError: another ending; no directory to write in.
         """
-        path = Path(path)
+        path = file_path("path", path)
         check_place("path", path, (".csv", ".json"))
         with replacing(path) as draft:
             draft.write_text(self._json() if path.suffix == ".json" else self._csv())
@@ -171,13 +168,13 @@ class Atlas:
         return text.getvalue()
 
 
-def load_atlas(path: str | os.PathLike[str]) -> Atlas:
+def load_atlas(path: str | os.PathLike[str] | Any) -> Atlas:
     """The atlas that `Atlas.save` wrote to F.json or F.csv.
 
     Raises:
         ValueError: no such file, or one that holds no atlas.
     """
-    path = Path(path)
+    path = file_path("path", path)
     if path.suffix not in (".csv", ".json"):
         raise ValueError(f"path must end in .csv or .json, got {path}: Atlas.save writes no others")
     try:
@@ -305,19 +302,18 @@ def _orbit(pendulum: Pendulum, row: dict[str, Any]) -> PeriodicOrbit:
 
 
 def _range(name: str, bounds: Any) -> tuple[float, float]:
-    try:
-        low, high = (float(bound) for bound in bounds)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a pair (low, high), got {bounds!r}") from None
+    low, high = (known_real(name, bound) for bound in several(name, bounds, "a pair (low, high)", 2))
     if not low <= high:
-        raise ValueError(f"{name} must be a pair (low, high) with low at most high, got {bounds!r}")
+        raise ValueError(
+            f"{name} must be a pair (low, high) with low at most high, got {shown(bounds)}: give them in order"
+        )
     return low, high
 
 
 # --- one release angle ------------------------------------------------------------------------------------------------
 
 
-def find_brake_orbits(pendulum: Pendulum, *, theta1: Any, max_period: Any) -> Atlas:
+def find_brake_orbits(pendulum: Pendulum | Any, *, theta1: Any, max_period: Any) -> Atlas:
     """Every orbit released from rest at `theta1` with a period of at most `max_period`: all its partners theta2.
 
     The returns to rest are all zeros of (p1, p2) in (theta2, t), found cell by cell (see `scan`). The scan is repeated
@@ -338,7 +334,7 @@ def find_brake_orbits(pendulum: Pendulum, *, theta1: Any, max_period: Any) -> At
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    fixed = known_pendulum(pendulum)
+    fixed = swinging_pendulum(pendulum)
     theta1 = known_number("theta1", theta1, unit="rad")
     max_period = known_period(fixed, max_period)
     counts: list[int] = []

@@ -21,9 +21,10 @@ import typer
 
 import dpend
 from dpend.atlas import pendulum_record
+from dpend.checks import number
 from dpend.files import check_place, json_text, replacing
 from dpend.orbits import BRANCHES, PeriodicOrbit
-from dpend.pendulum import Pendulum, State, number
+from dpend.pendulum import Pendulum, State
 from dpend.steppers import METHODS
 from dpend.sweeps import check_store
 from dpend.trajectory import Status, Trajectory

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from dpend.pendulum import Pendulum, Scalar, State, vector_field
-from dpend.steppers import Scheme
+from dpend.checks import function, known_number, one_of
+from dpend.pendulum import Pendulum, Scalar, State, check_motion, vector_field
+from dpend.steppers import Scheme, check_scheme
 from dpend.trajectory import fold
 
 # Newton's method from the end of a step needs five or six; each bisection of the bracket takes one more.
@@ -53,13 +54,13 @@ class _Search(NamedTuple):
 
 
 def first_crossing(
-    functions: Callable[[Pendulum, State], Any],
-    pendulum: Pendulum,
-    state: State,
-    duration: float,
-    scheme: Scheme,
+    functions: Callable[[Pendulum, State], Any] | Any,
+    pendulum: Pendulum | Any,
+    state: State | Any,
+    duration: float | Any,
+    scheme: Scheme | Any,
     *,
-    direction: int = 0,
+    direction: int | Any = 0,
 ) -> Crossing:
     """The first time 0 < t <= duration at which one of `functions` crosses zero.
 
@@ -76,9 +77,11 @@ def first_crossing(
     Raises:
         ValueError: direction is none of these; as `flow`.
     """
-    if direction not in (-1, 0, 1):
-        raise ValueError(f"direction must be -1, 0 or 1, got {direction!r}")
-    return _first_crossing(functions, pendulum, state, float(duration), scheme, direction)
+    function("functions", functions, "(pendulum, state)", "lambda pendulum, state: state.theta2")
+    check_motion(pendulum, state)
+    check_scheme(scheme)
+    duration, direction = known_number("duration", duration, unit="s"), one_of("direction", direction, (-1, 0, 1))
+    return _first_crossing(functions, pendulum, state, duration, scheme, direction)
 
 
 class _Landing(NamedTuple):

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +16,7 @@ import numpy as np
 from jax import lax
 
 from dpend._runtime import require_float64
+from dpend.checks import integer, known_number, known_real, known_value, numbers, real, single
 from dpend.continuation import (
     LARGEST_COVER,
     Curve,
@@ -33,8 +33,8 @@ from dpend.continuation import (
     way_to,
     without_its_image,
 )
-from dpend.orbits import BRANCHES, PeriodicOrbit, mirrored
-from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
+from dpend.orbits import BRANCHES, PeriodicOrbit, mirrored, swinging_pendulum
+from dpend.pendulum import Pendulum, Scalar, State, check_pendulum, hamiltonian
 from dpend.shooting import (
     FIRST_STEP,
     METRIC,
@@ -45,7 +45,7 @@ from dpend.shooting import (
     sensitivities,
 )
 from dpend.stability import stability_of
-from dpend.trajectory import Status, known_number, known_value
+from dpend.trajectory import Status
 
 # The longest step: a hundred points or so for a family, close enough for cubics to show every turn.
 _LONGEST_STEP = 0.1
@@ -136,7 +136,7 @@ class Family:
         """The sentence that says what its status means."""
         return _MESSAGES[Status(int(self.status))]
 
-    def at(self, theta1: Scalar, *, crossing: int = 1) -> PeriodicOrbit:
+    def at(self, theta1: Scalar, *, crossing: int | Any = 1) -> PeriodicOrbit:
         """The orbits of this family released at `theta1`: Newton's method from where its curve passes.
 
         An orbit released at (-theta1, -theta2) counts; where the curve has it, the mirror image is returned.
@@ -289,15 +289,13 @@ _PIECES = 8
 
 def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
     """See `Family.at`."""
-    if not isinstance(crossing, Integral) or isinstance(crossing, bool) or crossing < 1:
-        raise ValueError(f"crossing must be an integer of at least 1, got {crossing!r}")
+    crossing = integer("crossing", crossing)
+    theta1 = real("theta1", theta1) if isinstance(theta1, jax.Array) else numbers("theta1", theta1, unit="rad")
+    theta1 = jnp.asarray(theta1, jnp.float64)
     try:
-        theta1 = jnp.asarray(theta1, jnp.float64)
         wanted = np.asarray(lax.stop_gradient(theta1))
     except jax.errors.TracerArrayConversionError:
         raise ValueError("theta1 must be a number here, not traced by jit: use find_orbit inside jit") from None
-    except (TypeError, ValueError):
-        raise ValueError(f"theta1 must be an angle or an array of them [rad], got {theta1!r}") from None
     if not wanted.size or not np.all(np.isfinite(wanted)) or np.any(np.abs(wanted) < _TINIEST):
         raise ValueError(
             f"theta1 must be finite and at least {_TINIEST:g} in size [rad], got {wanted}: give other angles"
@@ -575,12 +573,12 @@ def _roots(  # type: ignore[no-untyped-def]
 
 
 def follow_family(
-    pendulum: Pendulum,
-    start: "str | PeriodicOrbit | SpecialPoint",
+    pendulum: Pendulum | Any,
+    start: "str | PeriodicOrbit | SpecialPoint | Any",
     *,
-    longest_step: float = _LONGEST_STEP,
-    longest_period: float = math.inf,
-    most_points: int = _MOST_POINTS,
+    longest_step: float | Any = _LONGEST_STEP,
+    longest_period: float | Any = math.inf,
+    most_points: int | Any = _MOST_POINTS,
 ) -> Family:
     """The family of periodic orbits that `start` belongs to, from end to end.
 
@@ -609,19 +607,19 @@ def follow_family(
         al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
     """
     require_float64()
-    fixed = known_pendulum(pendulum)
+    fixed = _primal(pendulum)
     if not isinstance(start, (str, PeriodicOrbit, SpecialPoint)):
         raise ValueError(
-            f"start must be one of {', '.join(BRANCHES)}, an orbit or a special point, got {type(start).__name__}"
+            f"start must be one of {', '.join(BRANCHES)}, an orbit or a special point, got {type(start).__name__}: "
+            "give one of them"
         )
-    if not isinstance(longest_step, Real) or isinstance(longest_step, bool):
-        raise ValueError(f"longest_step must be a finite positive number, got {longest_step!r}: give a number")
-    step = float(number("longest_step", longest_step, positive=True))
-    period = math.inf
-    if not (isinstance(longest_period, float) and math.isinf(longest_period) and longest_period > 0):
-        period = float(number("longest_period", longest_period, positive=True, unit="s"))
-    if not isinstance(most_points, Integral) or most_points < 2:
-        raise ValueError(f"most_points must be an integer of at least 2, got {most_points!r}")
+    step, most_points = (
+        known_number("longest_step", longest_step, positive=True),
+        integer("most_points", most_points, least=2),
+    )
+    period = known_real("longest_period", longest_period, unit="s")
+    if period != math.inf:
+        known_number("longest_period", period, positive=True, unit="s")
     scaled = jax.tree.map(np.float64, natural(fixed))
     reach = Reach(step, most_points, period / math.sqrt(fixed.l1 / fixed.g))
     if isinstance(start, str):
@@ -633,18 +631,19 @@ def follow_family(
     return _from_orbit(pendulum, scaled, start, reach)
 
 
-def known_pendulum(pendulum: Pendulum) -> Pendulum:
-    """The numbers behind a pendulum.
+def _primal(pendulum: Any) -> Pendulum:
+    """The numbers behind a pendulum, also under eager differentiation, whose derivatives `Family.at` carries on.
 
     Raises:
-        ValueError: no pendulum; a field traced by `jit`; g not positive.
+        ValueError: no pendulum; a field that is an array or traced by `jit`; g not positive.
     """
-    if not isinstance(pendulum, Pendulum):
-        raise ValueError(f"pendulum must be a Pendulum, got {type(pendulum).__name__}")
-    values = {name: known_number(name, leaf) for name, leaf in vars(pendulum).items()}
-    if not values["g"] > 0:
-        raise ValueError(f"g must be positive for orbits, got {values['g']:g}: nothing swings back without gravity")
-    return Pendulum(**values)
+    check_pendulum(pendulum)
+    numbers = {}
+    for name, leaf in vars(pendulum).items():
+        single(name, leaf)
+        known = known_value(leaf)
+        numbers[name] = leaf if known is None else known
+    return swinging_pendulum(Pendulum(**numbers))  # which refuses what `jit` traces
 
 
 _beginning = jax.jit(beginning)
@@ -669,7 +668,7 @@ def _too_short(reach: Reach) -> ValueError:
 
 
 def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reach: Reach) -> Family:
-    fixed = known_pendulum(pendulum)
+    fixed = _primal(pendulum)
     if np.shape(orbit.period):
         raise ValueError(
             f"start must be a single orbit, got one with shape {np.shape(orbit.period)}: choose one of them"

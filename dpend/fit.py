@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dpend._runtime import require_float64
+from dpend.checks import known_number, several, shown
 from dpend.measurements import FEWEST, Angles, best_width, checked, local_cubics, wrapped
-from dpend.pendulum import Pendulum, Scalar, State, momenta, normal_modes
-from dpend.trajectory import Status, known_number
+from dpend.pendulum import Pendulum, Scalar, State, known_pendulum, momenta, normal_modes
+from dpend.trajectory import Status
 from dpend.windows import (
     PRICES,
     ROUNDED,
@@ -388,11 +389,8 @@ def fit_parameters(
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    pendulum = Pendulum() if pendulum is None else pendulum
-    if not isinstance(pendulum, Pendulum):
-        raise ValueError(f"pendulum must be a Pendulum, got {pendulum!r:.60}: give dpend.Pendulum(l1=...)")
+    numbers = known_pendulum(Pendulum() if pendulum is None else pendulum)
     names = _checked_free(free)
-    numbers = Pendulum(*(known_number(name, getattr(pendulum, name)) for name in _BY_FIELD))
     if "g" in names and numbers.g == 0:
         raise ValueError(
             "g must not start at 0 where it is free, got 0: give its sign and size by a start above or below"
@@ -411,9 +409,10 @@ def fit_parameters(
 def _checked_free(free: Any) -> tuple[str, ...]:
     names = (free,) if isinstance(free, str) or not hasattr(free, "__iter__") else tuple(free)
     for name in names:
-        if name not in tuple(_BY_FIELD) or names.count(name) > 1:
+        if not isinstance(name, str) or name not in _BY_FIELD or names.count(name) > 1:
+            listed = ", ".join(name if isinstance(name, str) else shown(name) for name in names)
             raise ValueError(
-                f"free must hold each of {', '.join(_BY_FIELD)} once at most, got {', '.join(map(str, names))}"
+                f"free must hold each of {', '.join(_BY_FIELD)} once at most, got {listed}: give names like ('l2', 'g')"
             )
     if {"l1", "l2", "g"} <= set(names):
         raise ValueError("free must not hold l1, l2 and g: only l2/l1 and g/l1 enter the angles: fix one of l1, l2, g")
@@ -423,11 +422,7 @@ def _checked_free(free: Any) -> tuple[str, ...]:
 
 
 def _checked_initial(initial: Any) -> tuple[float | None, ...]:
-    values = tuple(initial) if hasattr(initial, "__iter__") else (initial,)
-    if len(values) != len(INITIAL):
-        raise ValueError(
-            f"initial must be {', '.join(INITIAL)}, got {len(values)} values: give None for what is estimated"
-        )
+    values = several("initial", initial, f"{', '.join(INITIAL)}", len(INITIAL))
     return tuple(
         None if value is None else known_number(f"initial {name}", value)
         for name, value in zip(INITIAL, values, strict=True)
@@ -491,6 +486,9 @@ _FASTER = 4.0
 _COARSEST, _LONGEST = math.pi / 2, 1e6
 
 
+_momenta = jax.jit(momenta)
+
+
 def _result(
     series: Angles,
     pendulum: Pendulum,
@@ -509,7 +507,8 @@ def _result(
     noisy = _is_noise(residuals, noise, settings.noise, problem.freedom)
     factors = dict(zip(free, np.exp(found.point.fields), strict=True))
     values = {name: np.float64(getattr(pendulum, name) * factors.get(name, 1.0)) for name in _BY_FIELD}
-    best = Pendulum(**{name: jnp.asarray(value) for name, value in values.items()})
+    # Where nothing was fitted these are NaN, which no constructor takes: the status tells.
+    best = jax.tree.unflatten(jax.tree.structure(pendulum), [jnp.asarray(value) for value in values.values()])
     node = found.point.nodes[:, 0]
     ratios = np.array([values["l2"] / values["l1"], values["m2"] / values["m1"], values["g"] / values["l1"]])
     scale = np.append([values[name] for name in free], np.ones(4))
@@ -520,7 +519,7 @@ def _result(
     deviations = np.concatenate([errors[: len(free)], known.ratios * np.abs(ratios), errors[len(free) :]])
     return Fit(
         pendulum=best,
-        state=State(*(jnp.asarray(leaf) for leaf in jax.tree.leaves(momenta(best, *(jnp.asarray(x) for x in node))))),
+        state=_momenta(best, *node),
         estimates=dict(zip(names, estimates, strict=True)),
         standard_errors=dict(zip(names, deviations, strict=True)),
         covariance=covariance,

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from dpend.checks import file_path, numbers
+
 
 class Angles(NamedTuple):
     """A checked series: times [s], shape (m,), and angles [rad], shape (2, m), NaN where nothing was measured."""
@@ -51,10 +53,7 @@ def checked(times: Any, theta1: Any, theta2: Any) -> Angles:
 
 
 def _column(name: str, column: Any, unit: str, gaps: bool = False) -> np.ndarray:
-    try:
-        array = np.asarray(column, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers [{unit}], got {column!r:.60}: give an array of numbers") from None
+    array = numbers(name, column, unit=unit, gaps=gaps)
     if array.ndim != 1:
         raise ValueError(f"{name} must have one dimension, got shape {array.shape}: give one number for each time")
     wrong = np.isinf(array) if gaps else ~np.isfinite(array)
@@ -65,7 +64,7 @@ def _column(name: str, column: Any, unit: str, gaps: bool = False) -> np.ndarray
     return array
 
 
-def load_angles(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+def load_angles(path: str | Path | Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Times [s] and both angles [rad] of a CSV file with columns time_s, theta1_deg, theta2_deg, in any order.
 
     One of the angles may be absent (None is returned for it), and cells of both may be empty (NaN). Other columns are
@@ -76,7 +75,7 @@ def load_angles(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, np.nda
             increase, fewer than 7 angles of a rod, angles that look like radians; with the row, counted from the
             header, which is row 1.
     """
-    path = Path(path)
+    path = file_path("path", path)
     rows, lines = _rows(path)
     header = [name.strip() for name in rows[0]]
     present = [name for name in _COLUMNS if f"{name}_deg" in header]

@@ -20,16 +20,26 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from dpend._runtime import require_float64
-from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, normal_modes, number, released, vector_field
+from dpend.checks import at_most_one, flag, integer, is_traced, known_value, number, one_of, several, single
+from dpend.pendulum import (
+    Pendulum,
+    Scalar,
+    State,
+    check_pendulum,
+    hamiltonian,
+    known_pendulum,
+    normal_modes,
+    released,
+    vector_field,
+)
 from dpend.shooting import PARTS, Walk, arc_of, arc_times, beginning, fastest, hermite, natural, stride
 from dpend.stability import stability_class, stability_of, transition
 from dpend.steppers import Scheme
-from dpend.trajectory import Status, known_value, march, moved, step_size
+from dpend.trajectory import Status, march, moved, step_size
 
 BRANCHES = ("in-phase", "anti-phase")
 SYMMETRIES = ("centred", "brake")
@@ -641,18 +651,18 @@ def _cover(
 
 
 def find_orbit(
-    pendulum: Pendulum,
+    pendulum: Pendulum | Any,
     theta1: Scalar,
     *,
-    branch: str | None = None,
-    guess: tuple[Scalar, Scalar] | None = None,
-    symmetry: str | None = None,
-    ratio: int | None = None,
-    crossing: int = 1,
-    turn: float = _FINE,
-    tolerance: float = 1e-13,
-    max_iterations: int = 40,
-    error: bool = True,
+    branch: str | Any | None = None,
+    guess: tuple[Scalar, Scalar] | Any | None = None,
+    symmetry: str | Any | None = None,
+    ratio: int | Any | None = None,
+    crossing: int | Any = 1,
+    turn: float | Any = _FINE,
+    tolerance: float | Any = 1e-13,
+    max_iterations: int | Any = 40,
+    error: bool | Any = True,
 ) -> PeriodicOrbit:
     """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period.
 
@@ -693,19 +703,22 @@ def find_orbit(
         normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159: the quarter period.
     """
     require_float64()
-    theta1 = number("theta1", theta1, unit="rad")
+    theta1, crossing = number("theta1", theta1, unit="rad"), integer("crossing", crossing)
     _check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
     settings = {
-        "error": bool(error),
+        "error": flag("error", error),
         "turn": number("turn", turn, positive=True, unit="rad"),
         "tolerance": number("tolerance", tolerance, positive=True),
-        "max_iterations": max_iterations,
+        # This may be traced: it bounds a loop.
+        "max_iterations": max_iterations if is_traced(max_iterations) else integer("max_iterations", max_iterations),
     }
+    for name, value in settings.items():
+        single(name, value)
     theta1 = jnp.asarray(theta1, jnp.float64)
     if guess is None:
         slow = (branch or ("in-phase" if ratio == 1 else "anti-phase")) == "in-phase"
         return _on_branch(pendulum, theta1, slow, crossing, float(ratio or 0), **settings)
-    theta2, period = (jnp.asarray(number(n, v), jnp.float64) for n, v in zip(("theta2", "period"), guess, strict=True))
+    theta2, period = (jnp.asarray(value, jnp.float64) for value in _guessed(guess))
     if ratio is None:
         line, x = _Line(jnp.stack([theta1, 0.0]), jnp.array([0.0, 1.0])), theta2
     else:
@@ -728,23 +741,21 @@ def _check_request(  # type: ignore[no-untyped-def]
     pendulum: Pendulum, theta1: Scalar, branch, guess, symmetry, ratio, crossing
 ) -> None:
     """Refuses what cannot be asked, as far as the values are known before tracing."""
-    if branch is not None and branch not in BRANCHES:
-        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
-    if symmetry is not None and symmetry not in SYMMETRIES:
-        raise ValueError(f"symmetry must be one of {', '.join(SYMMETRIES)}, got {symmetry!r}")
-    if ratio not in (None, 1, -1):
-        raise ValueError(f"ratio must be 1 or -1, got {ratio!r}")
-    if branch is not None and guess is not None:
-        raise ValueError(f"branch and guess exclude each other, got {branch!r} and {guess}: give one of them")
+    check_pendulum(pendulum)
+    for name, value, words in (("branch", branch, BRANCHES), ("symmetry", symmetry, SYMMETRIES)):
+        if value is not None:
+            one_of(name, value, words)
+    if ratio is not None:
+        one_of("ratio", ratio, (1, -1))
+    at_most_one(branch=branch, guess=guess)
     if branch is None and guess is None and ratio is None:
         raise ValueError("branch must be given, or guess=(theta2, period), or ratio=1 or -1; got none of them")
     if symmetry is not None and guess is None:
         raise ValueError(f"symmetry goes with guess, got {symmetry!r} alone: orbits on a branch are centred")
-    if not isinstance(crossing, int) or crossing < 1 or (crossing > 1 and (branch is None or ratio is not None)):
-        raise ValueError(f"crossing must be an integer of at least 1, and goes with branch alone, got {crossing!r}")
+    if crossing > 1 and (branch is None or ratio is not None):
+        raise ValueError(f"crossing must be 1 but with branch alone, got {crossing}: leave it out")
     for name, value in {"theta1": theta1, **vars(pendulum)}.items():
-        if np.ndim(value):
-            raise ValueError(f"{name} must be a scalar, got shape {np.shape(value)}: map over many with jax.vmap")
+        single(name, value)
     gravity, angle1 = known_value(pendulum.g), known_value(theta1)
     if angle1 is not None and not math.isfinite(angle1):
         raise ValueError(f"theta1 must be a finite number [rad], got {angle1}: give another theta1")
@@ -757,7 +768,7 @@ def _check_request(  # type: ignore[no-untyped-def]
                 "the branches pass there only in equilibrium"
             )
         return
-    theta2, period = (known_value(number(name, value)) for name, value in zip(("theta2", "period"), guess, strict=True))
+    theta2, period = (known_value(value) for value in _guessed(guess))
     if period is not None and not period > 0:
         raise ValueError(f"period must be positive [s], got {period:g}: give another guess")
     if angle1 is not None and theta2 is not None and _multiple_of_pi(angle1) and _multiple_of_pi(theta2):
@@ -765,6 +776,26 @@ def _check_request(  # type: ignore[no-untyped-def]
             f"theta2 must not be a multiple of 180 degrees with theta1 at {math.degrees(angle1):g} degrees, "
             f"got {math.degrees(theta2):g} degrees: that is an equilibrium"
         )
+
+
+def _guessed(guess: Any) -> tuple[Scalar, Scalar]:
+    """theta2 [rad] and the period [s] of a guess, checked."""
+    theta2, period = several("guess", guess, "a pair (theta2, period)", 2)
+    for name, value in (("theta2", theta2), ("period", period)):
+        single(f"guess of {name}", value)
+    return number("guess of theta2", theta2, unit="rad"), number("guess of period", period, unit="s")
+
+
+def swinging_pendulum(pendulum: Any) -> Pendulum:
+    """A pendulum whose fields are plain numbers and that has orbits.
+
+    Raises:
+        ValueError: as `known_pendulum`; g not positive.
+    """
+    fixed = known_pendulum(pendulum)
+    if not fixed.g > 0:
+        raise ValueError(f"g must be positive for orbits, got {fixed.g:g}: nothing swings back without gravity")
+    return fixed
 
 
 def _multiple_of_pi(angle: float) -> bool:

@@ -22,8 +22,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from dpend.pendulum import Pendulum, Scalar, State
-from dpend.steppers import Point, Scheme
+from dpend.checks import known_number, known_real, real
+from dpend.pendulum import Pendulum, Scalar, State, check_motion
+from dpend.steppers import Point, Scheme, check_scheme
 from dpend.trajectory import march, step_size
 
 
@@ -46,14 +47,19 @@ def transition(
     return scheme.leave(constants, end), jnp.stack(jax.tree.leaves(tangents))
 
 
-def monodromy(pendulum: Pendulum, state: State, period: float, scheme: Scheme) -> Float[Array, "4 4"]:
+def monodromy(
+    pendulum: Pendulum | Any, state: State | Any, period: float | Any, scheme: Scheme | Any
+) -> Float[Array, "4 4"]:
     """The derivative of the flow over a whole period: needs no symmetry, and is noise once kappa exceeds 1e12.
 
     Arguments:
         period: the time [s], known before tracing.
     Raises:
-        ValueError: the step is longer than the period.
+        ValueError: the step is longer than the period; arguments of other classes, arrays, a traced period.
     """
+    check_motion(pendulum, state)
+    check_scheme(scheme)
+    period = known_number("period", period, unit="s")
     steps = scheme.steps(period)
     return transition(pendulum, state, step_size(period, steps), steps, scheme)[1]
 
@@ -135,16 +141,25 @@ def _log_abs(value: Any, xp: Any) -> Any:
 _LARGEST_EXPONENT, _MANY_DIGITS, _LARGEST_C = 700.0, 20.0, 1e150
 
 
-def multipliers(kappa: Scalar) -> Complex[Array, "4"]:
-    """The Floquet multipliers 1, 1, m, 1/m with m + 1/m = 2 kappa and |m| >= 1."""
-    kappa = jnp.asarray(kappa, jnp.complex128)
+def multipliers(kappa: Scalar) -> Complex[Array, "4 ..."]:
+    """The Floquet multipliers 1, 1, m, 1/m with m + 1/m = 2 kappa and |m| >= 1, NaN where kappa is.
+
+    Raises:
+        ValueError: kappa is neither a real number nor an array of them.
+    """
+    kappa = jnp.asarray(real("kappa", kappa), jnp.complex128)
     large = kappa + jnp.sqrt(kappa - 1) * jnp.sqrt(kappa + 1)  # the two principal roots never cancel against kappa
     one = jnp.ones_like(large)
     return jnp.stack([one, one, large, 1 / large])
 
 
-def stability_class(kappa: float) -> str:
-    """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where kappa is NaN."""
+def stability_class(kappa: float | Any) -> str:
+    """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where kappa is NaN.
+
+    Raises:
+        ValueError: kappa is no single real number, or traced.
+    """
+    kappa = known_real("kappa", kappa)
     if kappa != kappa:
         return "unknown"
     if abs(kappa) == 1:

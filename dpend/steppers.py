@@ -31,13 +31,14 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from dpend.checks import flag, instance, known_number, one_of
 from dpend.pendulum import (
     Pendulum,
     Scalar,
     State,
     fast_frequency,
     hamiltonian,
-    number,
+    known_pendulum,
     vector_field,
 )
 from dpend.trig import sincos
@@ -486,7 +487,7 @@ class Scheme:
         written_out: whether all stages of a step are written out, or run as a loop: slower to compile, faster for many
             lanes. By default the circle forms are, and order 8 in (theta, p) is not.
     Raises:
-        ValueError: an unknown name; a step that is not finite and positive.
+        ValueError: an unknown name; a step that is not finite and positive, or traced; written_out not a boolean.
     """
 
     name: str
@@ -494,9 +495,10 @@ class Scheme:
     written_out: bool | None = None
 
     def __post_init__(self) -> None:
-        if self.name not in METHODS:
-            raise ValueError(f"method must be one of {', '.join(METHODS)}, got {self.name!r}")
-        object.__setattr__(self, "step", float(number("step", self.step, positive=True, unit="s")))
+        object.__setattr__(self, "name", one_of("method", self.name, tuple(METHODS)))
+        object.__setattr__(self, "step", known_number("step", self.step, positive=True, unit="s"))
+        if self.written_out is not None:
+            object.__setattr__(self, "written_out", flag("written_out", self.written_out))
 
     @property
     def order(self) -> int:
@@ -613,12 +615,13 @@ class Scheme:
         longest = _LONGEST_PACE ** (1 / _PACE_POWER)
         return lax.stop_gradient(jnp.clip(height, longest, 1.0) ** _PACE_POWER)
 
-    def steps(self, duration: float) -> int:
+    def steps(self, duration: float | Any) -> int:
         """The number of even steps that a motion of `duration` [s] takes: ceil(|duration|/step - 1e-9).
 
         Raises:
-            ValueError: the step is longer than the motion.
+            ValueError: the step is longer than the motion; the duration is no known finite number.
         """
+        duration = known_number("duration", duration, unit="s")
         count = abs(duration) / self.step
         if 0.0 < count < 1.0 - 1e-9:
             raise ValueError(
@@ -626,6 +629,15 @@ class Scheme:
                 "give a smaller step"
             )
         return math.ceil(count - 1e-9)
+
+
+def check_scheme(scheme: Any) -> None:
+    """Refuses what is no `Scheme`.
+
+    Raises:
+        ValueError: another class, a method's name among them.
+    """
+    instance("scheme", scheme, Scheme, 'dpend.Scheme("rk8", 1e-3) or dpend.scheme_for(pendulum, 1e-9)')
 
 
 # The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th percentile over
@@ -677,7 +689,7 @@ _SHORTER_FOR_MASSES = (
 )
 
 
-def scheme_for(pendulum: Pendulum, tolerance: float) -> Scheme:
+def scheme_for(pendulum: Pendulum | Any, tolerance: float | Any) -> Scheme:
     """The fastest scheme for many motions whose angles are to be right to `tolerance`, 99 in 100 of them.
 
     "Right" is measured on releases from rest over the whole square of angles, after about two periods of the slow
@@ -688,9 +700,10 @@ def scheme_for(pendulum: Pendulum, tolerance: float) -> Scheme:
         tolerance: of the larger angle [rad]; below 2e-11 the step is that of 2e-11, where rounding takes over, above
             3e-2 that of 3e-2. Measured for mass ratios m2/m1 of 0.01 to 100 and lengths l2/l1 of 0.25 to 4.
     Raises:
-        ValueError: tolerance not positive; gravity zero, which sets no time.
+        ValueError: tolerance not positive; gravity zero, which sets no time; a traced argument.
     """
-    tolerance = float(number("tolerance", tolerance, positive=True, unit="rad"))
+    pendulum = known_pendulum(pendulum)
+    tolerance = known_number("tolerance", tolerance, positive=True, unit="rad")
     frequency = float(fast_frequency(pendulum))
     if not frequency > 0:
         raise ValueError(f"g must not be zero for a tolerance, got {float(pendulum.g)}: give a method and a step")

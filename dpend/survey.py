@@ -20,10 +20,11 @@ import numpy as np
 
 from dpend._runtime import require_float64
 from dpend.atlas import Atlas, Coverage, is_return, known_period, returns, stacked, table_of
+from dpend.checks import file_path, function
 from dpend.continuation import away_from, way_to
-from dpend.families import Family, follow_family, known_pendulum
+from dpend.families import Family, follow_family
 from dpend.files import check_place, json_text, replacing
-from dpend.orbits import PeriodicOrbit, find_orbit
+from dpend.orbits import PeriodicOrbit, find_orbit, swinging_pendulum
 from dpend.pendulum import Pendulum
 from dpend.scan import Zero
 from dpend.trajectory import Status
@@ -42,11 +43,11 @@ _PARTNER, _PAIR = 0.03, 0.1
 
 
 def find_brake_families(
-    pendulum: Pendulum,
+    pendulum: Pendulum | Any,
     *,
     max_period: Any,
-    store: str | os.PathLike[str] | None = None,
-    progress: Callable[[int, int, int], None] | None = None,
+    store: str | os.PathLike[str] | Any | None = None,
+    progress: Callable[[int, int, int], None] | Any | None = None,
 ) -> Atlas:
     """Every family of orbits released from rest with a period of at most `max_period`, on the whole square of angles.
 
@@ -70,19 +71,22 @@ def find_brake_families(
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    fixed = known_pendulum(pendulum)
+    fixed = swinging_pendulum(pendulum)
     max_period = known_period(fixed, max_period)
+    place = None if store is None else file_path("store", store)
+    if progress is not None:
+        function("progress", progress, "(slices done, slices planned, families)", "print")
     survey = _Survey(fixed, max_period)
-    if store is not None:
-        survey = _resumed(survey, Path(store))
+    if place is not None:
+        survey = _resumed(survey, place)
     for level in range(_MOST_LEVELS):
         angles = np.pi * (2 * np.arange(2**level) + 1) / 2 ** (level + 1)
         planned = 2 ** (max(level + 1, _FIRST_LEVELS)) - 1
         for angle in angles.tolist():
             if angle not in survey.slices:
                 survey.look_at(angle, level)
-                if store is not None:
-                    _keep(survey, Path(store))
+                if place is not None:
+                    _keep(survey, place)
             if progress is not None:
                 progress(len(survey.slices), planned, len(survey.tracks))
         newest = max((track.level for track in survey.tracks), default=0)

@@ -21,9 +21,10 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
+from dpend.checks import file_path, flag, function, known_number, numbers, shown, text
 from dpend.files import unwritable
 from dpend.lanes import launches, over_lanes
-from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
+from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, known_pendulum
 from dpend.steppers import Scheme, scheme_for
 from dpend.trajectory import Status
 
@@ -56,19 +57,19 @@ _TOLERANCE = 1e-6
 
 
 def sweep(
-    quantity: Quantity,
-    pendulum: Pendulum,
-    axes: Mapping[str, Any],
+    quantity: Quantity | Any,
+    pendulum: Pendulum | Any,
+    axes: Mapping[str, Any] | Any,
     *,
-    at: Mapping[str, float] | None = None,
-    tolerance: float | None = None,
-    method: str | None = None,
-    step: float | None = None,
-    error: str | None = None,
-    mirror: bool = True,
-    store: str | os.PathLike[str] | None = None,
-    name: str | None = None,
-    progress: Callable[[int, int, int], None] | None = None,
+    at: Mapping[str, float] | Any | None = None,
+    tolerance: float | Any | None = None,
+    method: str | Any | None = None,
+    step: float | Any | None = None,
+    error: str | Any | None = None,
+    mirror: bool | Any = True,
+    store: str | os.PathLike[str] | Any | None = None,
+    name: str | Any | None = None,
+    progress: Callable[[int, int, int], None] | Any | None = None,
 ) -> Any:
     """A quantity over one or two fields of `State` or `Pendulum`.
 
@@ -100,15 +101,23 @@ def sweep(
         RuntimeError: a store made by another version of this package; float64 is switched off in JAX.
     """
     require_float64()
-    grid = _Grid.checked(pendulum, axes, at or {})
+    example = "functools.partial(dpend.chaos.lyapunov, duration=10.0)"
+    function("quantity", quantity, "(pendulum, state, scheme)", example)
+    keyed = _Keyed.of(quantity)
+    grid = _Grid.checked(pendulum, axes, {} if at is None else at)
     scheme = _scheme(grid, tolerance, method, step)
-    if error not in (None, "half-step"):
-        raise ValueError(f'error must be None or "half-step", got {error!r}')
-    task = _Task(_Keyed.of(quantity), grid, scheme, error is not None, mirror)
+    if not (error is None or (isinstance(error, str) and error == "half-step")):
+        raise ValueError(f'error must be None or "half-step", got {shown(error)}: give one of them')
+    mirror = flag("mirror", mirror)
+    place = None if store is None else file_path("store", store)
+    name = None if name is None else text("name", name)
+    if progress is not None:
+        function("progress", progress, "(cells done, cells in all, steps)", "print")
+    task = _Task(keyed, grid, scheme, error is not None, mirror)
     _kinds(task)  # refuses a quantity that cannot be mapped before anything is computed
-    if store is None:
+    if place is None:
         return _labelled(task, _computed(task, progress), task.attributes(name, strict=False))
-    return _stored(task, Path(store), task.attributes(name, strict=True), progress)
+    return _stored(task, place, task.attributes(name, strict=True), progress)
 
 
 # --- what is asked ---------------------------------------------------------------------------------------------------
@@ -126,7 +135,15 @@ class _Keyed:
     def of(quantity: Quantity) -> "_Keyed":
         if not isinstance(quantity, partial):
             return _Keyed(quantity, (), ())
-        return _Keyed(quantity.func, quantity.args, tuple(sorted(quantity.keywords.items())))
+        keyed = _Keyed(quantity.func, quantity.args, tuple(sorted(quantity.keywords.items())))
+        try:
+            hash(keyed)
+        except TypeError:
+            raise ValueError(
+                "quantity must have settings that can be compared, numbers, text or tuples of them, "
+                f"got {shown(quantity.keywords)}: give a tuple for a list or an array"
+            ) from None
+        return keyed
 
     def __call__(self, *args: Any) -> Mapping[str, Scalar]:
         return self.function(*self.arguments, *args, **dict(self.keywords))
@@ -171,27 +188,37 @@ class _Grid:
     at: dict[str, float]
 
     @staticmethod
-    def checked(pendulum: Pendulum, axes: Mapping[str, Any], at: Mapping[str, float]) -> "_Grid":
+    def checked(pendulum: Pendulum | Any, axes: Mapping[str, Any] | Any, at: Mapping[str, float] | Any) -> "_Grid":
+        if isinstance(pendulum, Pendulum) and any(np.ndim(leaf) for leaf in vars(pendulum).values()):
+            raise ValueError("pendulum must have numbers for fields, got arrays: name those that vary as axes")
+        pendulum = known_pendulum(pendulum)
+        for name, given in (("axes", axes), ("at", at)):
+            if not isinstance(given, Mapping):
+                raise ValueError(
+                    f"{name} must be a dictionary by field, got {shown(given)}: give one like {{'p1': 0.1}}"
+                )
         if not 1 <= len(axes) <= 2:
-            raise ValueError(f"axes must be one or two, got {len(axes)}: {list(axes)}")
+            raise ValueError(f"axes must be one or two, got {len(axes)}: give one like {{'theta1': angles}}")
         for key in [*axes, *at]:
             if key not in _STATE + _PENDULUM:
-                raise ValueError(f"axes and at must be fields of State or Pendulum, got {key!r}: {', '.join(_UNITS)}")
+                known = ", ".join(_STATE + _PENDULUM)
+                raise ValueError(f"axes and at must be fields of State or Pendulum, got {key!r}: give one of {known}")
         twice = [key for key in at if key in axes or key in _PENDULUM]
         if twice:
             raise ValueError(f"at must name fields of State that are no axis, got {twice[0]!r}: leave it out")
         values = {}
         for key, given in axes.items():
-            array = np.asarray(given, np.float64)
+            array = numbers(f"axis {key}", given)
             if array.ndim != 1 or not array.size or not np.all(np.isfinite(array)):
-                raise ValueError(f"axis {key} must be a one-dimensional array of finite numbers, got {given!r}")
+                raise ValueError(
+                    f"axis {key} must be a one-dimensional array of finite numbers, got {shown(given)}: "
+                    "give other values"
+                )
             if key in ("l1", "l2", "m1", "m2") and np.any(array <= 0):
                 raise ValueError(f"axis {key} must be positive, got {array.min():g}: leave that out")
             values[key] = array
-        if not all(isinstance(getattr(pendulum, field), np.floating) for field in _PENDULUM):
-            raise ValueError("pendulum must have numbers for fields: name those that vary as axes")
         rest = {field: 0.0 for field in _STATE if field not in values}
-        return _Grid(pendulum, values, rest | {key: float(number(key, value)) for key, value in at.items()})
+        return _Grid(pendulum, values, rest | {key: known_number(key, value) for key, value in at.items()})
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -314,7 +341,7 @@ class _Task:
 
 def _scheme(grid: _Grid, tolerance: float | None, method: str | None, step: float | None) -> Scheme:
     if method is None and step is None:
-        wanted = float(number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad"))
+        wanted = known_number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad")
         ends = {key: (array.min(), array.max()) for key, array in grid.axes.items() if key in _PENDULUM}
         corners = np.array(np.meshgrid(*ends.values())).reshape(len(ends), -1).T if ends else [()]
         schemes = [
@@ -323,7 +350,7 @@ def _scheme(grid: _Grid, tolerance: float | None, method: str | None, step: floa
         ]
         return min(schemes, key=lambda scheme: scheme.step)  # the fastest pendulum's
     if tolerance is not None:
-        raise ValueError(f"tolerance excludes method and step, got {tolerance}: give either")
+        raise ValueError(f"tolerance excludes method and step, got {shown(tolerance)}: give either")
     if method is None or step is None:
         given, missing = ("step", "method") if method is None else ("method", "step")
         raise ValueError(f"{missing} must be given with {given}, got {given} alone: or give a tolerance")

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
-from numbers import Real
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -18,8 +17,32 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import ArrayLike
 
 from dpend._runtime import require_float64
-from dpend.pendulum import Pendulum, Scalar, State, energy_scale, fast_frequency, hamiltonian, number, vector_field
-from dpend.steppers import METHODS, Point, Scheme
+from dpend.checks import (
+    arrays,
+    at_most_one,
+    flag,
+    function,
+    integer,
+    known_number,
+    known_value,
+    number,
+    numbers,
+    one_of,
+    shown,
+    single,
+)
+from dpend.pendulum import (
+    Pendulum,
+    Scalar,
+    State,
+    check_motion,
+    check_state,
+    energy_scale,
+    fast_frequency,
+    hamiltonian,
+    vector_field,
+)
+from dpend.steppers import METHODS, Point, Scheme, check_scheme
 from dpend.trig import LARGEST_ANGLE, unwound, wound
 
 Carry = TypeVar("Carry")
@@ -68,8 +91,12 @@ _MESSAGES = {
 
 
 def message(status: Scalar) -> str:
-    """The sentence that says what `status`, a value of `Status`, means."""
-    return _MESSAGES[Status(int(status))]
+    """The sentence that says what `status`, a value of `Status`, means.
+
+    Raises:
+        ValueError: no such value, or an array of them.
+    """
+    return _MESSAGES[Status(one_of("status", integer("status", status, least=0), tuple(Status)))]
 
 
 @jax.tree_util.register_dataclass
@@ -160,32 +187,6 @@ def step_size(duration: Scalar, steps: Scalar) -> Scalar:
 
 def _float64(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float64)), tree)
-
-
-def known_value(value: Scalar) -> float | None:
-    """The number behind `value`, also under eager differentiation; None where it is traced."""
-    if isinstance(value, Real):  # NumPy's scalars too: under `jit`, stop_gradient would trace them
-        return float(value)
-    try:
-        return float(lax.stop_gradient(value))
-    except jax.errors.ConcretizationTypeError:
-        return None
-
-
-def known_number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> float:
-    """The finite number behind an argument that must be one here, also under eager differentiation.
-
-    Raises:
-        ValueError: it is none, traced by `jit`, an array, text, or with `positive` not above zero.
-    """
-    value = number(name, value, positive=positive, unit=unit)
-    try:
-        known = None if isinstance(value, bool) else known_value(value)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a single number, got {value!r}: give a number") from None
-    if known is None:
-        raise ValueError(f"{name} must be a number here, not traced by jit or a boolean, got {value!r}: give a number")
-    return float(number(name, known, positive=positive, unit=unit))
 
 
 # A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns ten thousand times
@@ -304,7 +305,7 @@ def _nothing(carry: Any, time: Scalar, dt: Scalar, state: State) -> Any:
     return carry
 
 
-def flow(pendulum: Pendulum, state: State, duration: Scalar, scheme: Scheme) -> State:
+def flow(pendulum: Pendulum | Any, state: State | Any, duration: Scalar, scheme: Scheme | Any) -> State:
     """The state after `duration`, no trajectory stored.
 
     Even methods take n = ceil(duration/step - 1e-9) steps of duration/n each; the rescaled one takes steps in its own
@@ -317,7 +318,7 @@ def flow(pendulum: Pendulum, state: State, duration: Scalar, scheme: Scheme) -> 
             traced one allows forward mode only, as does the rescaled method.
         scheme: method and step.
     Raises:
-        ValueError: duration not finite, or shorter than one even step.
+        ValueError: duration not finite, or shorter than one even step; arguments of other classes, arrays.
         RuntimeError: float64 is switched off in JAX.
     """
     end, _, _ = _accumulate(_nothing, None, pendulum, state, None, duration, scheme)
@@ -325,14 +326,14 @@ def flow(pendulum: Pendulum, state: State, duration: Scalar, scheme: Scheme) -> 
 
 
 def fold(
-    update: Callable[..., Any],
+    update: Callable[..., Any] | Any,
     init: Carry,
-    pendulum: Pendulum,
-    state: State,
+    pendulum: Pendulum | Any,
+    state: State | Any,
     duration: Scalar,
-    scheme: Scheme,
+    scheme: Scheme | Any,
     *,
-    tangents: State | None = None,
+    tangents: State | Any | None = None,
 ) -> Any:
     """Something accumulated along the motion: `init` after `update` has seen every step.
 
@@ -347,18 +348,23 @@ def fold(
     Returns:
         What `update` made of `init`; with `tangents`, that and the tangents at the end.
     Raises:
-        ValueError: duration not finite, or shorter than one even step.
+        ValueError: duration not finite, or shorter than one even step; arguments of other classes, arrays.
         RuntimeError: float64 is switched off in JAX.
     """
+    example = "lambda carry, time, dt, state: jnp.maximum(carry, state.theta1)"
+    function("update", update, "(carry, time, dt, state)", example)
+    arrays("init", init)
+    if tangents is not None:
+        check_state(tangents, "tangents")
     _, tangents, carry = _accumulate(update, init, pendulum, state, tangents, duration, scheme)
     return carry if tangents is None else (carry, tangents)
 
 
 def _accumulate(update, init, pendulum, state, tangents, duration, scheme):  # type: ignore[no-untyped-def]
     require_float64()
-    known = known_value(number("duration", duration, unit="s"))
-    if known is not None and not math.isfinite(known):
-        raise ValueError(f"duration must be a finite number [s], got {known}: give another duration")
+    check_motion(pendulum, state)
+    check_scheme(scheme)
+    known = _known_duration(duration)
     if not scheme.even:
         steps: Scalar = 0  # not known beforehand
     elif known is not None:
@@ -371,6 +377,15 @@ def _accumulate(update, init, pendulum, state, tangents, duration, scheme):  # t
     init = jax.tree.map(_weakly_float64, init)
     time = jnp.asarray(duration, jnp.float64)
     return compiled(update, init, pendulum, _float64(state), _float64(tangents), time, steps, scheme)
+
+
+def _known_duration(duration: Scalar) -> float | None:
+    """The length of a motion [s], checked; None where it is traced."""
+    single("duration", number("duration", duration, unit="s"))
+    known = known_value(duration)
+    if known is not None and not math.isfinite(known):  # under eager differentiation `number` does not see it
+        raise ValueError(f"duration must be a finite number [s], got {known}: give another duration")
+    return known
 
 
 def _weakly_float64(leaf: Any) -> Any:
@@ -488,16 +503,16 @@ def _angle_error(a: State, b: State) -> Scalar:
 
 
 def simulate(
-    pendulum: Pendulum,
-    state: State,
-    duration: float,
+    pendulum: Pendulum | Any,
+    state: State | Any,
+    duration: float | Any,
     *,
-    step: float | None = None,
-    method: str | None = None,
-    tolerance: float | None = None,
-    save_every: int = 1,
-    error: bool = True,
-    drift_tolerance: float | None = None,
+    step: float | Any | None = None,
+    method: str | Any | None = None,
+    tolerance: float | Any | None = None,
+    save_every: int | Any = 1,
+    error: bool | Any = True,
+    drift_tolerance: float | Any | None = None,
 ) -> Trajectory:
     """The motion from `state` over `duration`, with an estimate of its own error.
 
@@ -528,19 +543,22 @@ def simulate(
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    known = known_value(number("duration", duration, unit="s"))
-    if known is None or not math.isfinite(known) or known == 0.0:
-        raise ValueError(f"duration must be a finite number [s] other than zero, known before tracing, got {duration}")
-    if step is not None and tolerance is not None:
-        raise ValueError(f"step and tolerance exclude each other, got {step} and {tolerance}: give one of them")
-    if isinstance(save_every, bool) or not isinstance(save_every, (int, np.integer)) or save_every < 1:
-        raise ValueError(f"save_every must be an integer of at least 1, got {save_every!r}")
-    method = method or ("rk8-circle" if step is None else "rk8")
+    check_motion(pendulum, state)
+    known = _known_duration(duration)
+    if known is None or known == 0.0:
+        raise ValueError(
+            f"duration must be a finite number [s] other than zero, known before tracing, got {shown(duration)}: "
+            "give another duration"
+        )
+    at_most_one(step=step, tolerance=tolerance)
+    save_every, error = integer("save_every", save_every), flag("error", error)
+    method = ("rk8-circle" if step is None else "rk8") if method is None else one_of("method", method, tuple(METHODS))
     if drift_tolerance is None:
         drift_tolerance = math.inf if step is None else 1e-6
     else:
         drift_tolerance = number("drift_tolerance", drift_tolerance, positive=True)
-    if method in METHODS and not Scheme(method, 1.0).even:
+        single("drift_tolerance", drift_tolerance)
+    if not Scheme(method, 1.0).even:
         raise ValueError(f"method must take even steps to save states at, got {method!r}: give rk8-circle, or use flow")
     state = _float64(state)
     wanted = np.float64(_PARTED)
@@ -548,7 +566,8 @@ def simulate(
     if step is None:
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, state))):
             raise ValueError("tolerance needs a state and a pendulum that are known, got traced ones: give a step")
-        wanted = _MARGIN * number("tolerance", 1e-9 if tolerance is None else tolerance, positive=True, unit="rad")
+        tolerance = known_number("tolerance", 1e-9 if tolerance is None else tolerance, positive=True, unit="rad")
+        wanted = np.float64(_MARGIN * tolerance)
         scheme, estimate = _scheme_reaching(pendulum, state, known, method, wanted)
     else:
         scheme, estimate = Scheme(method, step), None if error else math.nan
@@ -558,7 +577,7 @@ def simulate(
             f"step must leave at most {_MOST_SAVED:,} states to save, got {scheme.step:g} s, which makes "
             f"{steps // save_every:,}: give a larger step or save_every, or a shorter duration"
         )
-    every = min(int(save_every), steps)
+    every = min(save_every, steps)
     time = jnp.asarray(duration, jnp.float64)
     if step is not None:
         return _simulate(pendulum, state, time, steps, scheme, every, None, estimate, wanted, drift_tolerance)
@@ -643,12 +662,12 @@ def _error_of(pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-de
 
 
 def reference(
-    pendulum: Pendulum,
-    state: State,
-    times: ArrayLike | Sequence[float],
+    pendulum: Pendulum | Any,
+    state: State | Any,
+    times: ArrayLike | Sequence[float] | Any,
     *,
-    tolerance: float = 1e-13,
-    error: bool = True,
+    tolerance: float | Any = 1e-13,
+    error: bool | Any = True,
 ) -> Trajectory:
     """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's integrators.
 
@@ -667,18 +686,20 @@ def reference(
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    tolerance = number("tolerance", tolerance, positive=True)
-    grid = np.atleast_1d(np.asarray(times, np.float64))
+    check_motion(pendulum, state)
+    error, tolerance = flag("error", error), number("tolerance", tolerance, positive=True)
+    single("tolerance", tolerance)
+    grid = np.atleast_1d(numbers("times", times, unit="s"))
+    if grid.ndim != 1:
+        raise ValueError(f"times must have one dimension, got shape {grid.shape}: give one number for each time")
     moves = np.diff(grid, prepend=0.0)
     ordered = (
         np.all(moves[1:] > 0) and grid[0] >= 0
         if grid.size and grid[-1] > 0
         else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
     )
-    if grid.ndim != 1 or not grid.size or not np.all(np.isfinite(grid)) or not ordered:
-        raise ValueError(
-            f"times must be finite and move away from zero in one direction, got {np.asarray(times)}: sort them"
-        )
+    if not grid.size or not np.all(np.isfinite(grid)) or not ordered:
+        raise ValueError(f"times must be finite and move away from zero in one direction, got {shown(grid)}: sort them")
     state = _float64(state)
     states, steps, done = _dopri8(pendulum, state, jnp.asarray(grid), tolerance)
     estimate = jnp.asarray(jnp.nan)

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import dpend
 from dpend import Pendulum, Scheme, State, Status
-from dpend.trajectory import known_value
+from dpend.checks import known_value
 
 RELEASE = dpend.released(np.radians(100), np.radians(-30))
 RK8 = Scheme("rk8", 4e-3)
