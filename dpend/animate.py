@@ -13,7 +13,7 @@ import numpy as np
 
 from dpend.checks import file_path, function, instance, known_number, shown
 from dpend.files import check_place, replacing
-from dpend.pendulum import Pendulum, State, check_motion, check_pendulum, fast_frequency, positions
+from dpend.pendulum import Pendulum, State, check_motion, check_pendulum, check_state, fast_frequency, positions
 from dpend.plots import LOWER, UPPER
 from dpend.trajectory import Trajectory, simulate
 
@@ -52,10 +52,12 @@ def motions_for(
         ValueError: duration or speed not positive; a speed at which the motion does not last for a frame; more than
             10 000 frames, or 1e7 steps.
     """
-    if not isinstance(releases, Sequence):
+    if not isinstance(releases, Sequence) or isinstance(releases, (str, bytes)):
         raise ValueError(f"releases must be a sequence of states, got {shown(releases)}: give one like [state]")
     for release in releases:
+        check_state(release, "releases")
         check_motion(pendulum, release)
+    check_pendulum(pendulum)
     interval = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
     duration = known_number("duration", duration, positive=True, unit="s")
     if not interval <= duration:

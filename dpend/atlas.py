@@ -192,9 +192,9 @@ def load_atlas(path: str | os.PathLike[str] | Any) -> Atlas:
         families, coverage = tuple(about["families"]), Coverage(**about["coverage"])
         return Atlas(Pendulum(*about["pendulum"].values()), about["max_period_s"], table, families, coverage)
     except OSError as error:
-        raise ValueError(f"path must be a file that can be read, got {path} ({error.strerror})") from None
+        raise ValueError(f"path must be a file that can be read, got {path} ({error.strerror}): give another") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"path must be a file that Atlas.save wrote, got {path} ({error})") from None
+        raise ValueError(f"path must be a file that Atlas.save wrote, got {path} ({error}): give another") from None
 
 
 # --- the table --------------------------------------------------------------------------------------------------------

@@ -26,6 +26,8 @@ from dpend._runtime import require_float64
 
 Choice = TypeVar("Choice", str, int)
 
+# Beyond it float64, in which lanes are counted, has no neighbouring integers.
+_LARGEST_INTEGER = 2**53
 # Characters of a value that an error shows.
 _LONGEST = 80
 _SHORTENED = reprlib.Repr()
@@ -60,10 +62,14 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
         ValueError: anything else: text, complex numbers, booleans, None, lists, integers beyond the range of float64.
     """
     if isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.timedelta64)):
+        known: float | None
         try:
-            return np.float64(float(value))
-        except (OverflowError, ValueError):
-            raise ValueError(f"{name} must be {wanted}, got {shown(value)}: give one below 1.8e308") from None
+            known = float(value)
+        except (OverflowError, ValueError):  # the latter for a NaN that decimal arithmetic signals
+            known = None
+        if known is None or (math.isinf(known) and value != known):
+            raise ValueError(f"{name} must be {wanted}, got {shown(value)}: give one below 1.8e308")
+        return np.float64(known)
     if not isinstance(value, (np.ndarray, jax.Array, jax.ShapeDtypeStruct)) and hasattr(value, "__array__"):
         value = np.asarray(value)  # of another library
     kind = getattr(value, "dtype", None)
@@ -97,6 +103,17 @@ def number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> 
     if wrong:
         raise ValueError(f"{name} must be {wanted}, got {shown(value)}: give another {name}")
     return value
+
+
+def coordinate(name: str, value: Any, *, unit: str) -> Any:
+    """A coordinate of a state as float64: a finite number, or an array that JAX has computed, which may hold a NaN.
+
+    Where a motion was lost its end is NaN, and what goes on from there says so by its status.
+
+    Raises:
+        ValueError: as `number`.
+    """
+    return real(name, value) if isinstance(value, jax.Array) else number(name, value, unit=unit)
 
 
 def single(name: str, value: Any) -> None:
@@ -159,20 +176,25 @@ def known_number(name: str, value: Any, *, positive: bool = False, unit: str = "
     return known_real(name, number(name, value, positive=positive, unit=unit), unit=unit)
 
 
-def integer(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
-    """An integer in a range: Python's, NumPy's, or an array of a single one.
+def integer(name: str, value: Any, *, least: int = 1) -> int:
+    """An integer of at least `least`: Python's, NumPy's, or an array of a single one.
 
     Raises:
-        ValueError: anything else, also floats, booleans and traced values.
+        ValueError: anything else, also floats, booleans, traced values and what no loop counts to.
     """
     given = value
     if isinstance(value, (np.ndarray, jax.Array)) and not is_traced(value) and np.ndim(value) == 0:
         value = np.asarray(value)[()]
-    whole = isinstance(value, Integral) and not isinstance(value, bool)
-    if not whole or value < least or (most is not None and value > most):
-        span = f"of at least {least}" if most is None else f"from {least} to {most}"
+    whole = _is_whole(value)
+    if not whole or not least <= value <= _LARGEST_INTEGER:
+        span = f"of at least {least}" + (" and at most 2^53" if whole and value > least else "")
         raise ValueError(f"{name} must be an integer {span}, got {shown(given)}: give one like {least}")
     return int(value)
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether a value is an integer; Python counts booleans among them, NumPy spans of time."""
+    return isinstance(value, Integral) and not isinstance(value, (bool, np.timedelta64))
 
 
 def numbers(name: str, values: Any, *, unit: str = "", gaps: bool = False) -> np.ndarray:
@@ -228,9 +250,8 @@ def one_of(name: str, value: Any, allowed: Sequence[Choice]) -> Choice:
     Raises:
         ValueError: anything else.
     """
-    numeric = isinstance(value, Integral) and not isinstance(value, bool)
     for choice in allowed:
-        if (numeric or isinstance(value, str)) and value == choice:
+        if (_is_whole(value) or isinstance(value, str)) and value == choice:
             return choice
     words = [str(choice) for choice in allowed]
     if allowed and not isinstance(allowed[0], str):

@@ -582,10 +582,12 @@ def _orbits_asked(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[floa
             f"branch must be one of {', '.join(BRANCHES)}, or a sequence of them, got {shown(branch)}: give such"
         )
     branches = tuple(one_of("branch", one, BRANCHES) for one in branches)
-    several = isinstance(theta1, (Sequence, np.ndarray)) and not isinstance(theta1, str) and np.ndim(theta1) > 0
-    angles = tuple(theta1) if several else (theta1,) * len(branches)
+    listed = isinstance(theta1, (list, tuple)) or (isinstance(theta1, (np.ndarray, jax.Array)) and theta1.ndim > 0)
+    angles = tuple(theta1) if listed else (theta1,) * len(branches)
     if len(angles) != len(branches):
-        raise ValueError(f"theta1 must be one angle, or one a branch, got {len(angles)} for {len(branches)} branches")
+        raise ValueError(
+            f"theta1 must be one angle, or one a branch, got {len(angles)} for {len(branches)}: give {len(branches)}"
+        )
     known = tuple(known_number("theta1", angle, unit="rad") for angle in angles)
     for angle in known:
         if not 0 < angle < _LARGEST_ANGLE:

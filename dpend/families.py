@@ -287,7 +287,7 @@ _TINIEST = 1e-10
 _PIECES = 8
 
 
-def _at(family: Family, theta1: Scalar, crossing: int) -> PeriodicOrbit:
+def _at(family: Family, theta1: Scalar, crossing: int | Any) -> PeriodicOrbit:
     """See `Family.at`."""
     crossing = integer("crossing", crossing)
     theta1 = real("theta1", theta1) if isinstance(theta1, jax.Array) else numbers("theta1", theta1, unit="rad")
@@ -624,7 +624,7 @@ def follow_family(
     reach = Reach(step, most_points, period / math.sqrt(fixed.l1 / fixed.g))
     if isinstance(start, str):
         if start not in BRANCHES:
-            raise ValueError(f"start must be one of {', '.join(BRANCHES)}, or an orbit, got {start!r}")
+            raise ValueError(f"start must be one of {', '.join(BRANCHES)}, or an orbit, got {start!r}: give one")
         return _from_mode(Problem(pendulum, scaled, "centred", (0.0, 0.0)), start, reach)
     if isinstance(start, SpecialPoint):
         return _from_branch_point(pendulum, start, reach)

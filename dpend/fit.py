@@ -486,9 +486,6 @@ _FASTER = 4.0
 _COARSEST, _LONGEST = math.pi / 2, 1e6
 
 
-_momenta = jax.jit(momenta)
-
-
 def _result(
     series: Angles,
     pendulum: Pendulum,
@@ -519,7 +516,7 @@ def _result(
     deviations = np.concatenate([errors[: len(free)], known.ratios * np.abs(ratios), errors[len(free) :]])
     return Fit(
         pendulum=best,
-        state=_momenta(best, *node),
+        state=State(*(jnp.asarray(leaf) for leaf in jax.tree.leaves(momenta(best, *(jnp.asarray(x) for x in node))))),
         estimates=dict(zip(names, estimates, strict=True)),
         standard_errors=dict(zip(names, deviations, strict=True)),
         covariance=covariance,

@@ -738,7 +738,7 @@ def find_orbit(
 
 
 def _check_request(  # type: ignore[no-untyped-def]
-    pendulum: Pendulum, theta1: Scalar, branch, guess, symmetry, ratio, crossing
+    pendulum: Pendulum | Any, theta1: Scalar, branch, guess, symmetry, ratio, crossing
 ) -> None:
     """Refuses what cannot be asked, as far as the values are known before tracing."""
     check_pendulum(pendulum)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.checks import instance, known_number, known_value, number, one_shape, single
+from dpend.checks import coordinate, instance, known_number, known_value, number, one_shape, single
 from dpend.trig import sincos
 
 # A float64 scalar, or an array where a class holds many at once; transformations also pass tracers and placeholders.
@@ -103,7 +103,7 @@ class State:
 
     def __post_init__(self) -> None:
         for name, unit in (("theta1", "rad"), ("theta2", "rad"), ("p1", "kg m^2/s"), ("p2", "kg m^2/s")):
-            object.__setattr__(self, name, number(name, getattr(self, name), unit=unit))
+            object.__setattr__(self, name, coordinate(name, getattr(self, name), unit=unit))
         one_shape(**vars(self))
 
 
@@ -213,7 +213,7 @@ def released(theta1: Scalar, theta2: Scalar) -> State:
     Raises:
         ValueError: a Python number that is not finite.
     """
-    theta1, theta2 = number("theta1", theta1, unit="rad"), number("theta2", theta2, unit="rad")
+    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
     at_rest = jnp.zeros(jnp.broadcast_shapes(jnp.shape(theta1), jnp.shape(theta2)))
     return State(theta1, theta2, at_rest, at_rest)
 
@@ -264,8 +264,7 @@ def vector_field(pendulum: Pendulum | Any, state: State | Any) -> State:
     pull = (pendulum.m2 * pendulum.l1 * pendulum.l2) * (omega1 * omega2) * sin_delta
     torque1 = ((pendulum.m1 + pendulum.m2) * pendulum.g * pendulum.l1) * sin1
     torque2 = (pendulum.m2 * pendulum.g * pendulum.l2) * sin2
-    # Not a person's state: where a slope overflows it is NaN, and no argument is to blame.
-    return jax.tree.unflatten(jax.tree.structure(state), (omega1, omega2, -pull - torque1, pull - torque2))
+    return State(omega1, omega2, -pull - torque1, pull - torque2)
 
 
 def velocities(pendulum: Pendulum | Any, state: State | Any) -> tuple[Scalar, Scalar]:
@@ -282,8 +281,8 @@ def momenta(pendulum: Pendulum | Any, theta1: Scalar, theta2: Scalar, omega1: Sc
         ValueError: a Python number that is not finite.
     """
     check_pendulum(pendulum)
-    theta1, theta2 = number("theta1", theta1, unit="rad"), number("theta2", theta2, unit="rad")
-    omega1, omega2 = number("omega1", omega1, unit="rad/s"), number("omega2", omega2, unit="rad/s")
+    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
+    omega1, omega2 = coordinate("omega1", omega1, unit="rad/s"), coordinate("omega2", omega2, unit="rad/s")
     _, cos_delta = sincos(theta1 - theta2)
     coupling = pendulum.m2 * pendulum.l1 * pendulum.l2 * cos_delta
     p1 = (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * omega1 + coupling * omega2

@@ -490,9 +490,9 @@ class Scheme:
         ValueError: an unknown name; a step that is not finite and positive, or traced; written_out not a boolean.
     """
 
-    name: str
-    step: float
-    written_out: bool | None = None
+    name: str | Any
+    step: float | Any
+    written_out: bool | Any | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", one_of("method", self.name, tuple(METHODS)))

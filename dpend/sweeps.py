@@ -339,7 +339,7 @@ class _Task:
         }
 
 
-def _scheme(grid: _Grid, tolerance: float | None, method: str | None, step: float | None) -> Scheme:
+def _scheme(grid: _Grid, tolerance: Any, method: Any, step: Any) -> Scheme:
     if method is None and step is None:
         wanted = known_number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad")
         ends = {key: (array.min(), array.max()) for key, array in grid.axes.items() if key in _PENDULUM}
