@@ -459,12 +459,16 @@ ALSO = {
 ALSO_OF_A_DOOR = {("Scheme", "name"): ("method",)}
 
 
+def stop(*arguments: Any, **settings: Any) -> None:
+    raise PassedError
+
+
 def attempt(door: Door, argument: str, value: Any) -> None:
     """The call with one argument changed, up to where its work begins."""
     request = {**door.right, argument: value}
     with ExitStack() as stack:
         if door.work:
-            stack.enter_context(mock.patch(door.work, side_effect=PassedError))
+            stack.enter_context(mock.patch(door.work, stop))
         door.call(**request)
 
 
