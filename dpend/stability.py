@@ -22,7 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from dpend.checks import known_number, known_real, real
+from dpend.checks import known_number, known_real, known_value, real, single
 from dpend.pendulum import Pendulum, Scalar, State, check_motion
 from dpend.steppers import Point, Scheme, check_scheme
 from dpend.trajectory import march, step_size
@@ -157,9 +157,11 @@ def stability_class(kappa: float | Any) -> str:
     """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where kappa is NaN.
 
     Raises:
-        ValueError: kappa is no single real number, or traced.
+        ValueError: kappa is no single real number, or traced by `jit`.
     """
-    kappa = known_real("kappa", kappa)
+    single("kappa", real("kappa", kappa))
+    known = known_value(kappa)
+    kappa = known_real("kappa", kappa) if known is None else known
     if kappa != kappa:
         return "unknown"
     if abs(kappa) == 1:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -532,6 +533,55 @@ def test_without_the_type_checker(share):
     last_line = f"{count()} cases, 1 in {share} tried, 0 wrong\n"
     assert done.stdout == last_line, done.stdout + done.stderr
     assert count() > 5000
+
+
+# Arguments that any transformation may trace, and those that derivatives may.
+TRACEABLE = {
+    *(("Pendulum", name) for name in ("l1", "l2", "m1", "m2", "g")),
+    *((name, angle) for name in ("State", "released", "momenta") for angle in ("theta1", "theta2")),
+    *(("State", momentum) for momentum in ("p1", "p2")),
+    *(("momenta", rate) for rate in ("omega1", "omega2")),
+    *((name, "duration") for name in ("flow", "fold")),
+    ("fold", "init"),
+    ("simulate", "drift_tolerance"),
+    ("reference", "tolerance"),
+    ("multipliers", "kappa"),
+    *(("find_orbit", name) for name in ("theta1", "turn", "tolerance", "max_iterations")),
+}
+DIFFERENTIABLE = TRACEABLE | {
+    ("simulate", "duration"),
+    ("Family.at", "theta1"),
+    ("stability_class", "kappa"),
+}
+TRANSFORMATIONS = {
+    "jit": (jax.eval_shape, TRACEABLE),
+    "jvp": (lambda function, x: jax.jvp(function, (x,), (x,)), DIFFERENTIABLE),
+    "vmap": (lambda function, x: jax.vmap(function)(x[None]), TRACEABLE),
+}
+
+
+@pytest.mark.parametrize("name", TRANSFORMATIONS)
+def test_traced_arguments_pass_where_they_may_and_are_refused_in_words_elsewhere(name):
+    transformed, passing = TRANSFORMATIONS[name]
+    seen = set()
+    for key, door in DOORS.items():
+        for argument, (_, taken) in door.kinds.items():
+            numbers = [value for value in taken if type(value) in (int, float)]
+            if not numbers or (name == "jvp" and type(numbers[0]) is int):
+                continue
+
+            def call(x, door=door, argument=argument):
+                attempt(door, argument, x)
+                raise PassedError
+
+            with pytest.raises((PassedError, ValueError)) as caught:
+                transformed(call, jnp.asarray(numbers[0]))
+            if caught.type is PassedError:
+                seen.add((key, argument))
+            else:
+                caught.match(rf"\b{argument}\b.*(traced|tracing|Tracer)")
+    integers = {("find_orbit", "max_iterations")} if name == "jvp" else set()
+    assert seen == passing - integers
 
 
 def test_every_public_function_is_in_the_table():
