@@ -61,6 +61,8 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
     Raises:
         ValueError: anything else: text, complex numbers, booleans, None, lists, integers beyond the range of float64.
     """
+    if isinstance(value, float):  # the usual one, NumPy's float64 among them, without a look at anything else
+        return np.float64(value)
     if isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.timedelta64)):
         known: float | None
         try:

@@ -59,14 +59,15 @@ def _register(cls: type[Tree]) -> type[Tree]:
 class Pendulum:
     """The parameters of a double pendulum; bob 1 hangs from the pivot, bob 2 from bob 1.
 
-    The defaults are those of Yamaguchi's paper. Python numbers become float64 and are checked.
+    The defaults are those of Yamaguchi's paper. Whoever constructs one has its numbers checked and made float64, of
+    arrays the sign; tracers pass, and so does everything that libraries put into the tree by unflattening.
 
     Attributes:
         l1, l2: lengths of the rods [m], positive.
         m1, m2: masses of the bobs [kg], positive.
         g: acceleration of gravity [m/s^2], downwards; any finite number, but orbits and modes need g > 0.
     Raises:
-        ValueError: a parameter is not finite, or a length or mass not positive.
+        ValueError: a parameter is no finite number, or a length or mass not positive; arrays that do not broadcast.
         RuntimeError: float64 is switched off in JAX.
     """
 
@@ -93,7 +94,8 @@ class State:
         theta1, theta2: absolute angles from the downward vertical [rad], never wrapped.
         p1, p2: canonical momenta [kg m^2/s].
     Raises:
-        ValueError: a Python number that is not finite.
+        ValueError: a coordinate is no finite number; arrays that do not broadcast. An array, also a single number that
+            JAX has computed, may hold NaN: a motion that was lost.
     """
 
     theta1: Scalar
@@ -211,7 +213,7 @@ def released(theta1: Scalar, theta2: Scalar) -> State:
     """The state at rest with these angles [rad].
 
     Raises:
-        ValueError: a Python number that is not finite.
+        ValueError: an angle is no finite number, as for `State`.
     """
     theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
     at_rest = jnp.zeros(jnp.broadcast_shapes(jnp.shape(theta1), jnp.shape(theta2)))
@@ -278,7 +280,7 @@ def momenta(pendulum: Pendulum | Any, theta1: Scalar, theta2: Scalar, omega1: Sc
     """The state with these angles [rad] and angular velocities [rad/s]: p = M(delta) omega.
 
     Raises:
-        ValueError: a Python number that is not finite.
+        ValueError: an angle or a velocity is no finite number, as for `State`.
     """
     check_pendulum(pendulum)
     theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
