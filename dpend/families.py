@@ -85,12 +85,13 @@ class SpecialPoint:
         kind: `stability_lost` or `stability_gained` on the way along the family; `fold_theta1`, `fold_energy`, where
             the curve turns back in it; `resonance_k:n`, where the multipliers are exp(+-2 pi i n/k) and orbits of k
             times the period branch off; `crossing`, where another curve runs through this one, or passes it by less
-            than 2e-4, to which it is told apart from it.
+            than 2e-4. Of what lies within its error only folds and changes of stability are told, if they are not
+            taken back there.
         arclength: where, in the family's.
         orbit: the orbit there.
         slopes: derivatives with respect to arclength.
-        error_estimate: of arclength (this far from the point on both sides the change has certainly happened, or not
-            yet), and of the orbit's kappa, which is within this of what the kind says.
+        error_estimate: of arclength, and of the orbit's kappa. Rounding cannot hide on which side of the point a place
+            further away lies; kappa is within its error of what the kind says.
     """
 
     arclength: Scalar
@@ -113,7 +114,9 @@ class Family:
             that cut the arc into segments, plus the square of d log Delta, Delta being the fastest motion's share in a
             segment: nearly d log(period).
         slopes: derivatives with respect to arclength, shape (n,).
-        special_points: in order of arclength.
+        special_points: in order of arclength. Resonances where rounding leaves c (of brake orbits kappa) unknown to
+            1e-4 are left out, and stable windows between two orbits with them: some 1e-8 wide, between orbits whose
+            kappa is 1e10.
         status: `Status.CONVERGED` if the family was followed to its ends, `LEFT_BRANCH` if at one no step was short
             enough, `MAX_ITERATIONS` if it has more points than were allowed.
         ends: what its beginning and its end are: `normal mode` (of an equilibrium), `homoclinic` (the period grows
@@ -414,12 +417,14 @@ def _measure_error(rows: Corrected, symmetry: str) -> np.ndarray:
     return np.asarray(growth_of(rows.matrices, symmetry) * np.maximum(_ROUNDING, _LEVERAGE * spread))
 
 
-def _kappa_error(rows: Corrected, symmetry: str) -> np.ndarray:
-    error = _measure_error(rows, symmetry)
+def _kappa_error(spot: "_Spot", symmetry: str) -> float:
+    """What the kappa of a special point is known to: rounding, and what its place's error makes of it."""
+    error = float(_measure_error(spot.row, symmetry)[0] + abs(spot.steepness) * spot.error)
     if symmetry == "brake":
         return error
-    error = np.minimum(error, LARGEST_C)
-    return 4 * np.minimum(abs(_measure(rows, symmetry)), LARGEST_C) * error + 2 * error**2
+    error = min(error, LARGEST_C)
+    c = min(abs(float(_measure(spot.row, symmetry)[0])), LARGEST_C)
+    return 4 * c * error + 2 * error**2 + np.finfo(float).eps * (1 + 2 * c**2)
 
 
 def _values(tests: Sequence[_Test], problem: Problem, rows: Corrected) -> tuple[np.ndarray, np.ndarray]:
@@ -474,7 +479,9 @@ def _special_points(problem: Problem, rows: Corrected, curve: Curve, arclength: 
     zones = _crossings(track, samples)
     samples = _outside(zones, _with_extrema(track, _outside(zones, samples, with_ends=True)))
     changes = _changes(problem, samples)
-    places = [_Spot("crossing", z.place, CROSSING, z.row_at(problem, z.place), None) for z in zones]
+    places = [
+        _Spot("crossing", z.place, CROSSING, z.row_at(problem, z.place), z.steepness(problem), None) for z in zones
+    ]
     if changes:
         places += _told(changes, _located(track, changes, zones), places, samples.where, problem)
     return [_special(problem, spot) for spot in sorted(places, key=lambda spot: spot.where)]
@@ -507,6 +514,10 @@ class _Zone:
         }
         return some_of(rows, slice(best, best + 1))._replace(**mixed)
 
+    def steepness(self, problem: Problem) -> float:
+        """The slope of c, of brake orbits kappa, between its ends."""
+        return float(np.diff(_measure(self.rows, problem.symmetry))[0] / (self.ends[1] - self.ends[0]))
+
     def holds(self, low: float, high: float) -> bool:
         """Whether a stretch of the curve contains it."""
         return bool(low <= self.ends[0] and self.ends[1] <= high)
@@ -530,10 +541,10 @@ def _crossings(track: _Track, samples: _Samples) -> list[_Zone]:
         before = track.rows_at(middle).side == side[changes]
         low, high = np.where(before, middle, low), np.where(before, high, middle)
     places = 0.5 * (low + high)
-    # A leap is longer: nothing is known of what it passes over.
-    starts, ends = np.minimum(where[changes], places - CROSSING), np.maximum(where[changes + 1], places + CROSSING)
-    starts, ends = np.maximum(starts, where[0]), np.minimum(ends, where[-1])
-    groups = np.cumsum(np.append(False, starts[1:] <= ends[:-1]) == 0)
+    # Where the walk had to leap, the curves turn into each other: ten times as far away by a twentieth at most.
+    wide = np.where(where[changes + 1] - where[changes] > 4 * CROSSING, 10 * CROSSING, CROSSING)
+    starts, ends = np.maximum(places - wide, where[0]), np.minimum(places + wide, where[-1])
+    groups = np.cumsum(np.append(True, starts[1:] > ends[:-1]))
     zones = []
     for group in np.unique(groups):
         mine = np.flatnonzero(groups == group)
@@ -642,12 +653,15 @@ def _changes(problem: Problem, samples: _Samples) -> list[_Change]:
 
 
 class _Spot(NamedTuple):
-    """A special point to be: its kind, arclength, what that is known to, the row, and what branches off."""
+    """A special point to be: its kind, arclength, what that is known to, the row, the slope of c (of brake orbits
+    kappa) with arclength, and what branches off.
+    """
 
     kind: str
     where: float
     error: float
     row: Corrected
+    steepness: float
     branch: tuple[str, int] | None
 
 
@@ -659,17 +673,20 @@ def _located(track: _Track, changes: Sequence[_Change], zones: Sequence[_Zone]) 
     if solved:
         mine = [changes[i] for i in solved]
         where, rows = _roots(track, mine)
-        errors = _location_errors(track, mine, where, rows)
+        errors, slopes = _location_errors(track, mine, where, rows)
     for i, (change, zone) in enumerate(zip(changes, across, strict=True)):
         if zone is None:
             j = solved.index(i)
             place, error, row = float(where[j]), float(errors[j]), some_of(rows, slice(j, j + 1))
+            slope = float(slopes[j])
         else:
             width = change.high - change.low
             place = change.low + width * change.at_low / (change.at_low - change.at_high)
             inside = min(max(place, float(zone.ends[0])), float(zone.ends[1]))
-            place, error, row = inside, 0.5 * width, zone.row_at(track.problem, inside)
-        spots.append(_Spot(change.test.kind, place, error, row, change.test.branch))
+            place, row = inside, zone.row_at(track.problem, inside)
+            error = max(place - change.low, change.high - place)
+            slope = zone.steepness(track.problem)
+        spots.append(_Spot(change.test.kind, place, error, row, slope, change.test.branch))
     return spots
 
 
@@ -735,23 +752,29 @@ def _roots(track: _Track, changes: Sequence[_Change]) -> tuple[np.ndarray, Corre
 _WIDER = 10.0
 
 
-def _location_errors(track: _Track, changes: Sequence[_Change], where: np.ndarray, rows: Corrected) -> np.ndarray:
-    """How far from a root its test's sign is certain, on both sides, by looking."""
+def _location_errors(
+    track: _Track, changes: Sequence[_Change], where: np.ndarray, rows: Corrected
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far from a root its test's sign is certain, on both sides, by looking; and the slope of c between."""
     low, high, at_low, at_high = (np.array([change[k] for change in changes]) for k in (1, 2, 3, 4))
     _, error = _own_values(track, changes, rows)
     with np.errstate(over="ignore", invalid="ignore"):
         width = np.fmax(4 * error * (high - low) / np.abs(at_high - at_low), _LOCATED)
-    going = np.arange(len(changes))
+    slope, going = np.zeros(len(changes)), np.arange(len(changes))
     while going.size:
         mine = [changes[j] for j in going.tolist()]
-        certain = np.ones(going.size, bool)
+        certain, seen = np.ones(going.size, bool), []
         for side, end, sign in ((-1.0, low, np.sign(at_low)), (1.0, high, np.sign(at_high))):
             spot = np.clip(where[going] + side * width[going], low[going], high[going])
-            value, noise = _own_values(track, mine, track.rows_at(spot, some_of(rows, going)))
+            beside = track.rows_at(spot, some_of(rows, going))
+            value, noise = _own_values(track, mine, beside)
             certain &= (spot == end[going]) | (value * sign[going] > noise)
+            seen.append((spot, _measure(beside, track.problem.symmetry)))
+        (left, before), (right, after) = seen
+        slope[going] = (after - before) / (right - left)
         width[going] = np.where(certain, width[going], _WIDER * width[going])
         going = going[~certain]
-    return np.minimum(width, np.maximum(where - low, high - where))
+    return np.minimum(width, np.maximum(where - low, high - where)), slope
 
 
 # --- what is told of them
@@ -793,8 +816,8 @@ def _anchored(spot: _Spot, anchors: Sequence[_Spot], symmetry: str) -> _Spot:
     target = 1.0 if spot.kind == "above" else -1.0
     for other in anchors:
         off, error = _measure(other.row, symmetry)[0] - target, _measure_error(other.row, symmetry)[0]
-        if other.error < spot.error and abs(other.where - spot.where) <= spot.error and abs(off) <= error:
-            return spot._replace(where=other.where, error=other.error, row=other.row)
+        if other.error <= spot.error and abs(other.where - spot.where) <= spot.error and abs(off) <= error:
+            return other._replace(kind=spot.kind, branch=spot.branch)
     return spot
 
 
@@ -813,7 +836,7 @@ def _known_windows(bounds: list[_Spot], where: np.ndarray, symmetry: str) -> lis
 def _special(problem: Problem, spot: _Spot) -> SpecialPoint:
     both = _orbits(problem, spot.row), _slopes(problem, spot.row)
     orbit, slopes = jax.tree.map(lambda leaf: leaf[0], both)
-    errors = spot.error, float(_kappa_error(spot.row, problem.symmetry)[0])
+    errors = spot.error, _kappa_error(spot, problem.symmetry)
     return SpecialPoint(spot.where, orbit, slopes, errors, spot.kind, _Place(problem, spot.row), spot.branch)
 
 
