@@ -1,5 +1,8 @@
 """Families against numbers computed elsewhere, linear theory, single shooting, other integrators and scaling laws."""
 
+import dataclasses
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +10,7 @@ import pytest
 
 import dpend
 from dpend import Pendulum, Status
-from dpend.stability import stability_of, transition
+from dpend.stability import growth_of, stability_of, transition
 
 # m = l = g = 1: where c - 1 and c change sign, theta1, theta2, T (None where only theta1 is known).
 SPECIAL = {
@@ -85,6 +88,135 @@ def test_reference_values_and_special_points(families, branch):
             k, n = (int(text) for text in point.kind.removeprefix("resonance_").split(":"))
             kappa = np.cos(2 * np.pi * n / k)
         assert abs(point.orbit.kappa - kappa) < 1e-10
+
+
+def says(kind):
+    """The kappa that a kind of special point stands for; None where it stands for none."""
+    if kind.startswith("stability"):
+        return 1.0
+    if not kind.startswith("resonance"):
+        return None
+    k, n = (int(text) for text in kind.removeprefix("resonance_").split(":"))
+    return np.cos(2 * np.pi * n / k)
+
+
+def assert_special_points_are_what_they_say(family):
+    """Of a centred family: kappa by shooting over the quarter period in one piece, signs between the neighbouring
+    orbits, and no point twice.
+    """
+    points, names = family.special_points, {point.kind for point in family.special_points}
+    for point in points:
+        where, error = (float(number) for number in point.error_estimate)
+        assert 0 < where < 1e-3
+        if says(point.kind) is None:
+            continue
+        kappa, unsure = in_one_piece(point.orbit)
+        told = point.kind, where, error, float(point.orbit.kappa), kappa, unsure
+        assert error < 1e-3, told
+        assert abs(point.orbit.kappa - says(point.kind)) <= error, told
+        assert abs(kappa - says(point.kind)) <= error + unsure, told
+    for kind in names:
+        mine = [point for point in points if point.kind == kind]
+        for one, next_one in itertools.pairwise(mine):
+            apart = next_one.arclength - one.arclength
+            assert apart > one.error_estimate[0] + next_one.error_estimate[0], (kind, one.arclength)
+    for kind, slope in (("fold_theta1", family.slopes.theta1), ("fold_energy", family.slopes.energy)):
+        assert_signs_change(family, [p for p in points if p.kind == kind], slope / np.max(np.abs(slope)), 1e-12)
+    changes = [point for point in points if point.kind.startswith("stability")]
+    kinds = [point.kind for point in changes]
+    assert all(kind != other for kind, other in itertools.pairwise(kinds)), kinds
+    assert_signs_change(family, changes, 1 - np.asarray(family.orbits.kappa), 1e-9)
+    for point in changes:
+        after = np.flatnonzero(family.arclength > point.arclength + point.error_estimate[0])
+        before = np.flatnonzero(family.arclength < point.arclength - point.error_estimate[0])
+        at = {"stability_lost": before, "stability_gained": after}[point.kind]
+        if len(at):
+            assert family.orbits.kappa[at[-1 if point.kind == "stability_lost" else 0]] < 1 + 1e-9
+
+
+def assert_signs_change(family, points, values, tolerance):
+    """An odd number of points lies between two orbits if and only if the values there have opposite signs."""
+    places = np.array([float(point.arclength) for point in points])
+    errors = np.array([float(point.error_estimate[0]) for point in points])
+    where, values = np.asarray(family.arclength), np.asarray(values)
+    near = np.any(np.abs(where[:, None] - places) <= errors, axis=1) if len(points) else np.zeros(len(where), bool)
+    sure = np.flatnonzero((np.abs(values) > tolerance) & ~near)
+    passed = np.searchsorted(places, where[sure])
+    odd = np.diff(passed) % 2 == 1
+    np.testing.assert_array_equal(odd, np.sign(values[sure[1:]]) != np.sign(values[sure[:-1]]))
+
+
+def in_one_piece(orbit):
+    """kappa of a centred orbit from Phi(T/4), and what a release and a period rounded at 1e-14 leave of it."""
+
+    def kappa(theta2, period):
+        state = dataclasses.replace(orbit.state, theta2=theta2)
+        quarter = np.asarray(monodromy(dataclasses.replace(orbit, state=state, period=period), 0.25))
+        c = 1 - 2 * np.sum(quarter[:2, :2] * quarter[2:, 2:])
+        return 2 * c**2 - 1, float(growth_of(quarter[None], "centred"))
+
+    theta2, period = float(orbit.theta2), float(orbit.period)
+    here, grown = kappa(theta2, period)
+    moves = kappa(theta2 + 1e-12, period)[0] - here, kappa(theta2, period * (1 + 1e-12))[0] - here
+    return here, 1e-2 * np.sum(np.abs(moves)) + 4e-13 * grown
+
+
+def test_a_touch_a_fold_and_a_crossing_close_together():
+    """m2/m1 = 2: the in-phase family runs through the curve of threefold anti-phase orbits at theta1 = -0.1312, where c
+    touches 1, and gains its stability 0.0017 further on, where its energy turns back: c - 1 changes sign just there.
+    """
+    family = dpend.follow_family(Pendulum(1.0, 1.0, 1.0, 2.0, 1.0), "in-phase")
+    assert_special_points_are_what_they_say(family)
+    crossing, fold, gained = (p for p in family.special_points if abs(p.arclength - 2.0425) < 0.01)
+    assert [crossing.kind, fold.kind, gained.kind] == ["crossing", "fold_energy", "stability_gained"]
+    np.testing.assert_allclose([fold.arclength - crossing.arclength, gained.arclength - fold.arclength], [1.665e-3, 0],
+        atol=2e-6)  # fmt: skip
+    # There the anti-phase family has c = cos(2 pi/3), at a third of the period.
+    other = dpend.follow_family(Pendulum(1.0, 1.0, 1.0, 2.0, 1.0), "anti-phase")
+    third = next(p for p in other.special_points if p.kind == "resonance_3:2")
+    np.testing.assert_allclose(abs(third.orbit.theta1), abs(crossing.orbit.theta1), atol=2e-6)
+    np.testing.assert_allclose(3 * third.orbit.period, crossing.orbit.period, rtol=1e-6)
+    kinds = [p.kind for p in family.special_points if p.kind.startswith("stability")]
+    assert kinds == ["stability_lost", "stability_gained", "stability_lost"]
+
+
+@pytest.mark.slow
+def test_windows_narrower_than_rounding_are_not_told():
+    """l2/l1 = 18.13, m2/m1 = 6.64, anti-phase: within 3e-8 of arclength c passes from -1 to 1, and rounding leaves 0.04
+    of it unknown: there is no saying where which resonance is.
+    """
+    family = dpend.follow_family(Pendulum(1.0, 18.13, 1.0, 6.640, 1.0), "anti-phase")
+    assert_special_points_are_what_they_say(family)
+    assert not [p.kind for p in family.special_points if 4.0 < p.arclength < 4.2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lengths", "masses"), [(9.4, 2.64), (0.817, 12.176), (0.2302, 0.7196), (19.468, 5.775)])
+def test_stability_that_changes_at_a_crossing(lengths, masses):
+    """Where a family runs through fivefold (or more) orbits c - 1 vanishes with its derivatives, and the energy turns
+    back: one change of stability, there.
+    """
+    family = dpend.follow_family(Pendulum(1.0, lengths, 1.0, masses, 1.0), "in-phase")
+    assert_special_points_are_what_they_say(family)
+    crossings = [p for p in family.special_points if p.kind == "crossing"]
+    assert crossings
+    for crossing in crossings:
+        near = [p for p in family.special_points if abs(p.arclength - crossing.arclength) < 3e-4 and p is not crossing]
+        assert sorted(p.kind for p in near) == ["fold_energy", "stability_gained"]
+        assert near[0].arclength == near[1].arclength
+
+
+# Pendulums with l2/l1 and m2/m1 from 1/20 to 20.
+RANDOM = np.exp(np.random.default_rng(7).uniform(-np.log(20), np.log(20), (60, 2)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("some", range(6))
+@pytest.mark.parametrize("branch", BOTH)
+def test_special_points_of_random_pendulums(branch, some):
+    for lengths, masses in RANDOM[some::6]:
+        family = dpend.follow_family(Pendulum(1.0, lengths, 1.0, masses, 1.0), branch)
+        assert_special_points_are_what_they_say(family)
 
 
 @pytest.mark.parametrize("branch", BOTH)
