@@ -7,6 +7,7 @@ another digest is damaged. Nothing here knows what the values mean.
 
 import contextlib
 import errno
+import functools
 import hashlib
 import itertools
 import json
@@ -14,10 +15,12 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dpend.files import unwritable
 
@@ -44,6 +47,7 @@ class Store:
         coordinates: chunks of coordinates, by file name.
         arrays: the bytes of a chunk of every array that is computed, by name, in the order of writing.
         tiles: the indexes of all tiles, in the order of computing.
+        encode: the bytes of a chunk, from the name of its file, the cells and their values.
     """
 
     path: Path
@@ -52,6 +56,7 @@ class Store:
     coordinates: Mapping[str, bytes]
     arrays: Mapping[str, int]
     tiles: Sequence[tuple[int, ...]]
+    encode: Callable[[str, tuple[slice, ...], np.ndarray], bytes]
 
     def create(self) -> None:
         """An empty store, under a temporary name until it is whole; nothing where another process is faster."""
@@ -82,7 +87,7 @@ class Store:
                 f"store {self.path} was made by version {found['dpend_version']} of dpend, this is {ours}: "
                 "finish it with that version, or give another name"
             )
-        wanted = json.loads(self.documents["zarr.json"])["attributes"]
+        wanted = self._wanted
         for key in {**wanted, **found}:
             if _canonical(found.get(key)) != _canonical(wanted.get(key)):
                 raise ValueError(
@@ -143,7 +148,8 @@ class Store:
         for key in self.arrays:
             name = self.chunk(key, tile)
             try:
-                if self._line(key, tile) not in lines:
+                text = _read(self.path / name, self.arrays[key] + self.arrays[key] // 64 + 1024)
+                if self._line(name, text) not in lines:
                     problems[name] = "has other bytes than were written"
             except ValueError as error:
                 problems[name] = str(error)
@@ -151,14 +157,20 @@ class Store:
             problems[digest] = "has other lines"
         return problems
 
-    def _line(self, key: str, tile: tuple[int, ...]) -> bytes:
-        """An array's line in the digest of a tile: of its bytes, its place, and the sweep that it belongs to."""
-        name = self.chunk(key, tile)
-        text = _read(self.path / name, self.arrays[key] + self.arrays[key] // 64 + 1024)
-        identity = hashlib.sha256(_canonical(json.loads(self.documents["zarr.json"])["attributes"]).encode())
-        identity.update(name.encode())
-        identity.update(text)
-        return f"{identity.hexdigest()} {name}".encode()
+    def _line(self, name: str, text: bytes) -> bytes:
+        """A chunk's line in the digest of its tile: of its bytes, its place, and the sweep that it belongs to."""
+        digest = hashlib.sha256(f"{self._identity} {name} ".encode())
+        digest.update(text)
+        return f"{digest.hexdigest()} {name}".encode()
+
+    @functools.cached_property
+    def _identity(self) -> str:
+        return hashlib.sha256(_canonical(self._wanted).encode()).hexdigest()
+
+    @functools.cached_property
+    def _wanted(self) -> dict[str, Any]:
+        """The group's attributes, as JSON gives them back."""
+        return dict(json.loads(self.documents["zarr.json"])["attributes"])
 
     def chunk(self, key: str, tile: tuple[int, ...]) -> str:
         """The name of a chunk's file."""
@@ -183,23 +195,23 @@ class Store:
     def write(self, tile: tuple[int, ...], block: tuple[slice, ...], values: Mapping[str, Any]) -> None:
         """Writes a tile's values, the status after them, the digest last, each once the one before is on the disk."""
         try:
-            for key in self.arrays:
-                self._write_chunk(key, tile, block, values[key])
-            lines = [self._line(key, tile) + b"\n" for key in self.arrays]
-            _put(self.path, self._digest_name(tile), b"".join(lines))
+            lines = [self._write_chunk(key, tile, block, values[key]) for key in self.arrays]
+            _put(self.path, self._digest_name(tile), b"".join(line + b"\n" for line in lines))
         except OSError as error:
             raise self._unwritable(error) from None
 
-    def _write_chunk(self, key: str, tile: tuple[int, ...], block: tuple[slice, ...], values: Any) -> None:
-        self.array(key)[block] = values
-        _sync_up(self.path, self.chunk(key, tile))
+    def _write_chunk(self, key: str, tile: tuple[int, ...], block: tuple[slice, ...], values: np.ndarray) -> bytes:
+        """Writes an array's chunk; its line in the digest."""
+        name = self.chunk(key, tile)
+        text = self.encode(name, block, values)
+        _put(self.path, name, text)
+        return self._line(name, text)
 
     def array(self, key: str) -> Any:
-        """An array of the store, to be read and written."""
+        """An array of the store, to be read."""
         import zarr
 
-        # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
-        return zarr.open_array(self.path / key, mode="r+").with_config({"write_empty_chunks": True})
+        return zarr.open_array(self.path / key, mode="r")
 
     def open(self) -> Any:
         """The store as an `xarray.Dataset`, read when it is looked at."""

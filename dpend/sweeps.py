@@ -678,7 +678,14 @@ def _fill(work: _Work, store: Store, todo: dict[tuple[int, ...], tuple[slice, ..
 
 def _store(work: _Work, path: Path, attributes: dict[str, Any]) -> Store:
     """What the store of a sweep should hold."""
-    files = _files(work, attributes)
+    memory: dict[str, Any] = {}  # the files of an empty store, as Zarr writes them
+    arrays = _lay(work, attributes, memory)
+    files = _consolidated({name: buffer.to_bytes() for name, buffer in memory.items()})
+
+    def encode(name: str, block: tuple[slice, ...], values: np.ndarray) -> bytes:
+        arrays[name.partition("/")[0]][block] = values
+        return bytes(memory.pop(name).to_bytes())
+
     sides = work.task.grid.tile()
     counts = [-(-size // side) for size, side in zip(work.task.grid.shape, sides, strict=True)]
     return Store(
@@ -688,20 +695,19 @@ def _store(work: _Work, path: Path, attributes: dict[str, Any]) -> Store:
         coordinates={name: text for name, text in files.items() if not name.endswith("zarr.json")},
         arrays={key: math.prod(sides) * kind.itemsize for key, kind in work.kinds.items()},
         tiles=list(np.ndindex(*counts)),
+        encode=encode,
     )
 
 
-def _files(work: _Work, attributes: dict[str, Any]) -> dict[str, bytes]:
-    """The files of an empty store: what Zarr writes into memory."""
+def _lay(work: _Work, attributes: dict[str, Any], memory: dict[str, Any]) -> dict[str, Any]:
+    """An empty store in `memory`; the arrays that are computed. Each chunk ends in a checksum for any reader."""
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec
     from zarr.storage import MemoryStore
 
     grid = work.task.grid
-    memory: dict[str, Any] = {}
     degrees = " ".join(key for key in _coordinates(grid) if key not in grid.axes)
     group: Any = zarr.create_group(MemoryStore(memory), attributes=attributes | {_DEGREES: degrees})
-    # Any reader finds a bit that has changed: each chunk ends in a checksum.
     for key, (dim, values, units) in _coordinates(grid).items():
         array = group.create_array(
             key,
@@ -710,11 +716,11 @@ def _files(work: _Work, attributes: dict[str, Any]) -> dict[str, bytes]:
             chunks=values.shape,
             dimension_names=[dim],
             attributes=units,
-            compressors=[Crc32cCodec()],  # of other versions' compressors the bytes may differ
+            compressors=[Crc32cCodec()],  # not compressed: compressors of other versions may give other bytes
         )
         array[...] = values
-    for key, kind in work.kinds.items():
-        group.create_array(
+    return {
+        key: group.create_array(
             key,
             shape=grid.shape,
             dtype=kind,
@@ -723,8 +729,11 @@ def _files(work: _Work, attributes: dict[str, Any]) -> dict[str, bytes]:
             fill_value=int(Status.NOT_COMPUTED) if key == "status" else (math.nan if kind.kind == "f" else 0),
             attributes=_units(key),
             compressors=[ZstdCodec(level=0, checksum=False), Crc32cCodec()],
+            # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
+            config={"write_empty_chunks": True},
         )
-    return _consolidated({name: buffer.to_bytes() for name, buffer in memory.items()})
+        for key, kind in work.kinds.items()
+    }
 
 
 def _consolidated(files: dict[str, bytes]) -> dict[str, bytes]:
