@@ -10,6 +10,7 @@ import math
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,8 @@ from dpend.files import check_place, json_text, replacing
 from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State
 from dpend.steppers import METHODS
-from dpend.sweeps import check_store
+from dpend.stores import StoreWarning, check_store
+from dpend.sweeps import Cost
 from dpend.trajectory import Status, Trajectory
 
 app = typer.Typer(
@@ -293,6 +295,9 @@ def map_command(
     error: Annotated[
         str | None, typer.Option(help="half-step: a second pass at half the step, and an error for each cell.")
     ] = None,
+    most_steps: Annotated[
+        float, _numeric("--most-steps", help="Refuse a map of more steps, or a motion of more than a millionth of it.")
+    ] = 1e12,
     figure: Annotated[Path | None, typer.Option(help="Draw the map into P.png.")] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -313,7 +318,7 @@ def map_command(
     if figure is not None:
         check_place("figure", figure, (".png",))
     started, counts = time.perf_counter(), [0, 0, 0]
-    with _bar(sys.stderr.isatty(), "cells") as show:
+    with _complaints_of_stores(), _bar(sys.stderr.isatty(), "cells") as show:
 
         def tell(*now: int) -> None:
             counts[:] = now
@@ -329,13 +334,15 @@ def map_command(
             error=error,
             store=out,
             progress=tell,
+            announce=_announce,
+            most_steps=most_steps,
         )
     seconds = time.perf_counter() - started
-    status = field["status"].values
+    done, failed = _counts(field["status"])
     record = {
-        "cells": int(status.size),
-        "done": int(np.sum(status != Status.NOT_COMPUTED)),
-        "failed": int(np.sum((status != Status.NOT_COMPUTED) & (status != Status.CONVERGED))),
+        "cells": int(field["status"].size),
+        "done": done,
+        "failed": failed,
         "seconds": seconds,
         "steps_per_second": counts[2] / seconds,
         "scheme": {"method": field.attrs["method"], "step_s": field.attrs["step"]},
@@ -494,6 +501,49 @@ _MAPS = {
 
 # Along a map's side: sixteen times what a large map has; beyond it lies a slip of the finger.
 _MOST_CELLS = 65536
+
+
+# What is told before it is spent: more seconds, or bytes.
+_LONG, _LARGE = 60.0, 1e9
+
+
+def _announce(cost: Cost) -> None:
+    if cost.seconds > _LONG or cost.bytes > _LARGE:
+        _complain(
+            f"{cost.cells} cells to compute, about {cost.steps:.1e} steps, which may take {cost.seconds / 60:.0f} "
+            f"minutes, and values of {cost.bytes / 1e9:.2g} GB; stopped and started again, it goes on"
+        )
+
+
+@contextlib.contextmanager
+def _complaints_of_stores() -> Iterator[None]:
+    """Warnings about a store in one line each."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def tell(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, StoreWarning):
+                _complain(str(message))
+            else:
+                show(message, category, *where, **more)
+
+        warnings.simplefilter("always", StoreWarning)
+        warnings.showwarning = tell
+        yield
+
+
+# Rows of a map that are read at once, to be counted.
+_ROWS = 256
+
+
+def _counts(status: Any) -> tuple[int, int]:
+    """How many cells are done, and how many of them failed."""
+    done = failed = 0
+    for start in range(0, status.shape[0], _ROWS):
+        rows = status[start : start + _ROWS].values
+        done += int(np.sum(rows != Status.NOT_COMPUTED))
+        failed += int(np.sum((rows != Status.NOT_COMPUTED) & (rows != Status.CONVERGED)))
+    return done, failed
 
 
 def _size(text: str) -> tuple[int, int]:

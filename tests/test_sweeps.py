@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import ks_2samp
 
 import dpend
-from dpend import Pendulum, Status, chaos, sweeps
+from dpend import Pendulum, Status, chaos, stores, sweeps
 
 FLIP = partial(chaos.flip, duration=3.0)
 LYAPUNOV = partial(chaos.lyapunov, duration=2.0)
@@ -172,16 +172,16 @@ def test_an_unfinished_store_is_finished_with_the_same_bytes(paper, tmp_path, mo
     monkeypatch.setattr(sweeps, "_TILE", 7)
     axes = {"theta1": SIDE, "theta2": SIDE}
     dpend.sweep(FLIP, paper, axes, store=tmp_path / "whole.zarr")
-    write, stopped, tries = sweeps._write, tmp_path / "stopped.zarr", 0
+    write, stopped, tries = stores.Store._write_chunk, tmp_path / "stopped.zarr", 0
 
-    def breaks(path, array, block, values):
+    def breaks(*arguments):
         nonlocal tries
         tries += 1
         if tries % 6 == 0:
             raise KeyboardInterrupt
-        write(path, array, block, values)
+        write(*arguments)
 
-    monkeypatch.setattr(sweeps, "_write", breaks)
+    monkeypatch.setattr(stores.Store, "_write_chunk", breaks)
     for _ in range(200):
         try:
             dpend.sweep(FLIP, paper, axes, store=stopped)
