@@ -6,7 +6,6 @@ its rows; those of families over the whole square come from `survey`.
 
 import csv
 import io
-import json
 import math
 import os
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
+from dpend.catalogue import COLUMNS, UNITS, file_name, file_values, pendulum_record, read_catalogue
 from dpend.families import known_pendulum
 from dpend.files import check_place, json_text, replacing
 from dpend.orbits import SYMMETRIES, PeriodicOrbit, find_orbit
@@ -48,6 +48,8 @@ class Coverage:
             all returns found, those of orbits run through several times included: unequal if one is missing. Of several
             slices their sums.
         slices: release angles that were scanned.
+        exhausted: whether the search was broken off because it would have taken more than was allowed: what was found
+            is right, and more is likely to be missing.
     """
 
     theta2_points: int
@@ -57,6 +59,7 @@ class Coverage:
     winding: int
     degree: int
     slices: int = 1
+    exhausted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +123,9 @@ class Atlas:
 
     def record(self) -> dict[str, Any]:
         """All of it as plain numbers and text, angles in degrees: what `save` writes and `--json` prints."""
-        columns = {_file_name(key): _out(key, column).tolist() for key, column in self.table.items()}
+        columns = {file_name(key): file_values(key, column) for key, column in self.table.items()}
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         for row in rows:
-            row["status"] = Status(row["status"]).name.lower()
             row["dual"] = {key: row.pop(f"dual_{key}") for key in ("theta1_deg", "theta2_deg")}
             row["turns"] = [row.pop("turns1"), row.pop("turns2")]
         return {**self._about(), "orbits": rows}
@@ -149,9 +151,10 @@ class Atlas:
             "dpend_version": dpend.__version__,
             "pendulum": pendulum_record(self.pendulum),
             "max_period_s": self.max_period,
-            "units": dict(_UNITS),
+            "units": dict(UNITS),
             "coverage": asdict(self.coverage),
             "families": list(self.families),
+            "rows": len(self),
         }
 
     def _json(self) -> str:
@@ -164,99 +167,37 @@ class Atlas:
         text = io.StringIO()
         text.write("# " + json_text(self._about(), indent=None) + "\n")
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([_file_name(key) for key in self.table])
-        columns = {key: _out(key, column).tolist() for key, column in self.table.items()}
-        columns["status"] = [Status(status).name.lower() for status in columns["status"]]
-        writer.writerows(zip(*columns.values(), strict=True))
+        writer.writerow([file_name(key) for key in self.table])
+        writer.writerows(zip(*(file_values(key, column) for key, column in self.table.items()), strict=True))
         return text.getvalue()
 
 
 def load_atlas(path: str | os.PathLike[str]) -> Atlas:
-    """The atlas that `Atlas.save` wrote to F.json or F.csv.
+    """The atlas that `Atlas.save` wrote to F.json or F.csv, every row held to what is true of orbits.
+
+    Energies, kappa and its logarithm, both rests of a centred orbit and neighbours on a family have to agree, so that a
+    file that was damaged on its way is refused; a row whose status is another than `converged` need not agree.
 
     Raises:
-        ValueError: no such file, or one that holds no atlas.
+        ValueError: no such file, or one that holds no atlas: with the row, the column and what is wrong.
     """
     path = Path(path)
     if path.suffix not in (".csv", ".json"):
         raise ValueError(f"path must end in .csv or .json, got {path}: Atlas.save writes no others")
     try:
-        text = path.read_text()
-        if path.suffix == ".csv":
-            first, _, rest = text.partition("\n")
-            about, rows = json.loads(first.removeprefix("#")), list(csv.DictReader(io.StringIO(rest)))
-        else:
-            about = json.loads(text)
-            rows = about.pop("orbits")
-            for row in rows:
-                row |= {f"dual_{key}": value for key, value in row.pop("dual").items()}
-                row |= dict(zip(("turns1", "turns2"), row.pop("turns"), strict=True))
-        table = {key: _in(key, [row[_file_name(key)] for row in rows]) for key in _COLUMNS}
-        families, coverage = tuple(about["families"]), Coverage(**about["coverage"])
-        return Atlas(Pendulum(*about["pendulum"].values()), about["max_period_s"], table, families, coverage)
+        pendulum, max_period, table, families, coverage = read_catalogue(path)
     except OSError as error:
-        raise ValueError(f"path must be a file that can be read, got {path} ({error.strerror})") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"path must be a file that Atlas.save wrote, got {path} ({error})") from None
+        raise ValueError(
+            f"path must be a file that can be read, got {path} ({error.strerror}): give another file"
+        ) from None
+    except ValueError as error:
+        raise ValueError(
+            f"path must be a file that Atlas.save wrote, got {path} ({error}): give another file"
+        ) from None
+    return Atlas(pendulum, max_period, table, families, Coverage(**coverage))
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
-
-_UNITS = {
-    "theta1": "deg",
-    "theta2": "deg",
-    "dual_theta1": "deg",
-    "dual_theta2": "deg",
-    "theta2_error": "deg",
-    "period": "s",
-    "period_error": "s",
-    "energy": "J",
-}
-# Columns and their types; those without a unit here are as in `PeriodicOrbit` and `Family`.
-_COLUMNS: dict[str, type] = {
-    "family": str,
-    "arclength": float,
-    "theta1": float,
-    "theta2": float,
-    "period": float,
-    "energy": float,
-    "kappa": float,
-    "log_abs_kappa": float,
-    "symmetry": str,
-    "dual_theta1": float,
-    "dual_theta2": float,
-    "turns1": int,
-    "turns2": int,
-    "residual": float,
-    "theta2_error": float,
-    "period_error": float,
-    "iterations": int,
-    "status": int,
-}
-
-
-def pendulum_record(pendulum: Pendulum) -> dict[str, float]:
-    """A pendulum as it stands in files."""
-    names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
-    return {key: float(getattr(pendulum, name)) for name, key in names.items()}
-
-
-def _file_name(column: str) -> str:
-    return f"{column}_{_UNITS[column]}" if column in _UNITS else column
-
-
-def _out(column: str, values: np.ndarray) -> np.ndarray:
-    return np.degrees(values) if _UNITS.get(column) == "deg" else values
-
-
-def _in(column: str, values: list[Any]) -> np.ndarray:
-    if column == "status":
-        return np.array([int(Status[value.upper()]) for value in values], int)
-    kind = _COLUMNS[column]
-    array: np.ndarray = np.array(
-        [math.nan if kind is float and value is None else kind(value) for value in values], kind
-    )
-    return np.radians(array) if _UNITS.get(column) == "deg" else array
 
 
 def table_of(orbits: PeriodicOrbit, family: str, arclength: Any) -> dict[str, np.ndarray]:
@@ -275,14 +216,14 @@ def table_of(orbits: PeriodicOrbit, family: str, arclength: Any) -> dict[str, np
     columns |= {"iterations": orbits.iterations, "status": orbits.status, "arclength": arclength}
     count = len(np.asarray(orbits.period))
     columns |= {"family": np.full(count, family), "symmetry": np.full(count, orbits.symmetry)}
-    return {key: np.asarray(columns[key], kind) for key, kind in _COLUMNS.items()}
+    return {key: np.asarray(columns[key], kind) for key, kind in COLUMNS.items()}
 
 
 def stacked(tables: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """One table below the other."""
     return {
         key: np.concatenate([table[key] for table in tables]) if tables else np.zeros(0, kind)
-        for key, kind in _COLUMNS.items()
+        for key, kind in COLUMNS.items()
     }
 
 

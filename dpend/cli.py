@@ -20,7 +20,7 @@ import numpy as np
 import typer
 
 import dpend
-from dpend.atlas import pendulum_record
+from dpend.catalogue import pendulum_record
 from dpend.files import check_place, json_text, replacing
 from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
