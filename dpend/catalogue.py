@@ -240,10 +240,10 @@ def _json_parts(text: str) -> tuple[Any, _Rows]:
     own = [name for name in names if name[:5] not in ("dual_", "turns")] + ["dual", "turns"]
     rows = about.pop("orbits")
     for i, row in enumerate(rows):
-        _check_type(f"row {i + 1}", row, dict)
+        check_type(f"row {i + 1}", row, dict)
         _check_names(f"row {i + 1}", row, own)
         dual, turns = row.pop("dual"), row.pop("turns")
-        _check_type(f"row {i + 1}: dual", dual, dict)
+        check_type(f"row {i + 1}: dual", dual, dict)
         _check_names(f"row {i + 1}: dual", dual, angles)
         if type(turns) is not list or len(turns) != 2:
             raise ValueError(f"row {i + 1}: turns must be a list of two integers, is {turns!r:.60}")
@@ -264,23 +264,26 @@ def _column(column: str, rows: _Rows) -> np.ndarray:
     if kind is float:
         for i, cell in enumerate(cells):
             if not (cell is None or type(cell) is float):
-                _check_type(f"{rows.place(i)}: {file_name(column)}", cell, float)
+                check_type(f"{rows.place(i)}: {file_name(column)}", cell, float)
         values = np.array([math.nan if cell is None else cell for cell in cells], float)
         return np.radians(values) if UNITS.get(column) == "deg" else values
     for i, cell in enumerate(cells):
-        _check_type(f"{rows.place(i)}: {file_name(column)}", cell, kind)
+        check_type(f"{rows.place(i)}: {file_name(column)}", cell, kind)
     return np.array(cells, kind)
 
 
 # --- what is said about the table -------------------------------------------------------------------------------------
 
 
-def _check_type(place: str, value: Any, kind: type) -> None:
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def check_type(place: str, value: Any, kind: type) -> None:
     """Refuses what is of another type: a boolean is no number, and an integer is below 2^53."""
-    if kind is float:
-        good = type(value) in (int, float) and abs(value) <= sys.float_info.max
-    else:
-        good = type(value) is kind and not (kind is int and abs(value) >= 2**53)
+    good = _is_number(value) if kind is float else type(value) is kind
+    if kind is int and good:
+        good = abs(int(value)) < 2**53
     if not good:
         raise ValueError(f"{place} must be {_TYPES[kind]}, is {value!r:.60}")
 
@@ -297,29 +300,29 @@ def _check_names(place: str, names: Sequence[str] | dict[str, Any], wanted: Sequ
             raise ValueError(f"{place} has {what} {some[0]:.60}")
 
 
-def _check_record(place: str, record: Any, fields: Mapping[str, type]) -> None:
+def check_record(place: str, record: Any, fields: Mapping[str, type]) -> None:
     """Refuses what is no object with these fields."""
-    _check_type(place, record, dict)
+    check_type(place, record, dict)
     _check_names(place, record, list(fields))
     for name, value in record.items():
-        _check_type(f"{place}.{name}", value, fields[name])
+        check_type(f"{place}.{name}", value, fields[name])
 
 
 def _check_about(about: Any) -> tuple[Pendulum, float]:
     """The pendulum and the longest period."""
-    _check_record("the head", about, _ABOUT)
-    _check_record("pendulum", about["pendulum"], dict.fromkeys(_PENDULUM.values(), float))
+    check_record("the head", about, _ABOUT)
+    check_record("pendulum", about["pendulum"], dict.fromkeys(_PENDULUM.values(), float))
     for key, value in about["pendulum"].items():
-        _check_least(f"pendulum.{key}", value, 0, strict=True)
-    _check_least("max_period_s", about["max_period_s"], 0, strict=True)
-    _check_record("units", about["units"], dict.fromkeys(UNITS, str))
+        check_least(f"pendulum.{key}", value, 0, strict=True)
+    check_least("max_period_s", about["max_period_s"], 0, strict=True)
+    check_record("units", about["units"], dict.fromkeys(UNITS, str))
     for key, unit in UNITS.items():
         if about["units"][key] != unit:
             raise ValueError(f"units.{key} must be {unit}, is {about['units'][key]!r:.60}")
-    _check_record("coverage", about["coverage"], _COVERAGE)
+    check_record("coverage", about["coverage"], _COVERAGE)
     for key, value in about["coverage"].items():
         if key not in ("winding", "degree"):
-            _check_least(f"coverage.{key}", value, 0)
+            check_least(f"coverage.{key}", value, 0)
     for i, family in enumerate(about["families"]):
         _check_family(f"families[{i}]", family, about["max_period_s"])
     names = [family["family"] for family in about["families"]]
@@ -330,7 +333,7 @@ def _check_about(about: Any) -> tuple[Pendulum, float]:
     return Pendulum(**values), float(about["max_period_s"])
 
 
-def _check_least(place: str, value: float | int, least: float | int, strict: bool = False) -> None:
+def check_least(place: str, value: float | int, least: float | int, strict: bool = False) -> None:
     if value < least or (strict and value == least):
         raise ValueError(f"{place} must be {'above' if strict else 'at least'} {least:g}, is {value:.10g}")
 
@@ -342,7 +345,7 @@ def _check_one_of(place: str, value: Any, known: Sequence[str]) -> None:
 
 def _check_family(place: str, family: Any, max_period: float | int) -> None:
     """Refuses the record of a family that has another form, or special points beyond it."""
-    _check_record(place, family, _FAMILY)
+    check_record(place, family, _FAMILY)
     _check_one_of(f"{place}.symmetry", family["symmetry"], SYMMETRIES)
     if not re.fullmatch(family["symmetry"][0].upper() + r"[1-9]\d{0,8}", family["family"], re.ASCII):
         raise ValueError(f"{place}.family must be a {family['symmetry']} one's name, is {family['family']!r:.60}")
@@ -352,18 +355,18 @@ def _check_family(place: str, family: Any, max_period: float | int) -> None:
     for i, end in enumerate(family["ends"]):
         _check_one_of(f"{place}.ends[{i}]", end, _ENDS)
     shortest, longest, most = family["shortest_period_s"], family["longest_period_s"], max_period * (1 + _LONGEST)
-    _check_least(f"{place}.shortest_period_s", shortest, 0, strict=True)
-    _check_least(f"{place}.longest_period_s", longest, shortest * (1 - _SHORTEST))
+    check_least(f"{place}.shortest_period_s", shortest, 0, strict=True)
+    check_least(f"{place}.longest_period_s", longest, shortest * (1 - _SHORTEST))
     if longest > most:
         raise ValueError(f"{place}.longest_period_s is {longest:.10g}, max_period_s is {max_period:.10g}")
     last = 0.0
     for i, point in enumerate(family["special_points"]):
         where = f"{place}.special_points[{i}]"
-        _check_record(where, point, _SPECIAL)
+        check_record(where, point, _SPECIAL)
         if not _KIND.fullmatch(point["kind"]):
             raise ValueError(f"{where}.kind is not known: {point['kind']!r:.60}")
-        _check_least(f"{where}.arclength", point["arclength"], last)
-        _check_least(f"{where}.period_s", point["period_s"], shortest * (1 - _SHORTEST))
+        check_least(f"{where}.arclength", point["arclength"], last)
+        check_least(f"{where}.period_s", point["period_s"], shortest * (1 - _SHORTEST))
         if point["period_s"] > most:
             raise ValueError(f"{where}.period_s is {point['period_s']:.10g}, max_period_s is {max_period:.10g}")
         last = point["arclength"]

@@ -5,8 +5,6 @@ import io
 import json
 import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,7 +134,9 @@ DAMAGES = {
     "a number with a blank": (of_cell(3, "energy_J", lambda cell: " " + cell), r"row 3 in line 5: energy_J"),
     "a number with a low line": (of_cell(3, "period_error_s", "1_0"), r"row 3 in line 5: period_error_s"),
     "foreign digits": (of_cell(3, "iterations", "\u0663"), r"row 3 in line 5: iterations must be an integer"),
-    "a decimal comma": (of_text("csv", lambda text: text.replace("C1,0.0,0.", "C1,0.0,0,", 1)), r"row 1 in line 3 has 19"),
+    "a decimal comma": (
+        of_text("csv", lambda text: text.replace("C1,0.0,0.", "C1,0.0,0,", 1)), r"row 1 in line 3 has 19"
+    ),
     "an integer with a fraction": (of_cell(4, "turns1", "0.5"), r"row 4 in line 6: turns1 must be an integer"),
     "an integer of twenty digits": (of_cell(4, "iterations", "9" * 20), r"row 4 in line 6: iterations"),
     "a row too short": (of_csv(lambda rows: rows[5].pop()), r"row 5 in line 7 has 17 cells"),
@@ -289,7 +289,9 @@ DAMAGES = {
     "1e999": (of_text("json", lambda text: re.sub(r'"energy_J": [^,]*', '"energy_J": 1e999', text, count=1)),
               r"row 1: energy_J is inf"),
     "a key twice": (of_text("json", lambda text: text.replace('"kappa"', '"kappa": 1, "kappa"', 1)), r"'kappa' stands"),
-    "a second head": (of_text("json", lambda text: text.replace('"units"', '"orbits": [], "units"')), r"'orbits' stands"),
+    "a second head": (
+        of_text("json", lambda text: text.replace('"units"', '"orbits": [], "units"')), r"'orbits' stands"
+    ),
     "JSON cut off": (of_text("json", lambda text: text[: len(text) // 2]), r"line \d+ column \d+"),
     "JSON and more": (of_text("json", lambda text: text + "{}"), r"Extra data"),
     "a list": (of_text("json", lambda text: "[1]"), r"a list called orbits"),
@@ -408,7 +410,7 @@ def test_what_changes_no_number_is_read(atlas, files, tmp_path, name):
 
 
 def test_columns_may_stand_in_another_order(atlas, files, tmp_path):
-    ending, text = of_csv(lambda rows: [row.reverse() for row in rows])(files)
+    _, text = of_csv(lambda rows: [row.reverse() for row in rows])(files)
     (tmp_path / "turned.csv").write_text(text)
     same(atlas, dpend.load_atlas(tmp_path / "turned.csv"))
 
