@@ -21,10 +21,12 @@ import numpy as np
 import typer
 
 import dpend
-from dpend.atlas import pendulum_record
+from dpend import survey
+from dpend.atlas import MOST_STEPS, SECONDS_PER_STEP, expected_steps, known_period
+from dpend.catalogue import pendulum_record
 from dpend.checks import number
 from dpend.files import check_place, json_text, replacing
-from dpend.orbits import BRANCHES, PeriodicOrbit
+from dpend.orbits import BRANCHES, PeriodicOrbit, swinging_pendulum
 from dpend.pendulum import Pendulum, State
 from dpend.steppers import METHODS
 from dpend.stores import StoreWarning, check_store
@@ -162,6 +164,9 @@ def atlas(
     store: Annotated[
         Path | None, typer.Option(help="Of the whole square: F.json, from which a search that was stopped goes on.")
     ] = None,
+    most_steps: Annotated[
+        float, _numeric(help="Refuse a search that takes more time steps, or stop there: 1e9 take about an hour.")
+    ] = MOST_STEPS,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -175,14 +180,24 @@ def atlas(
     if out is not None:
         check_place("out", out, (".csv", ".json"))
     pendulum = Pendulum(l1, l2, m1, m2, g)
-    if theta1 is not None:
-        found = dpend.find_brake_orbits(pendulum, theta1=_radians("theta1", theta1), max_period=max_period)
-    else:
-        with _bar(sys.stderr.isatty(), "slices") as show:
+    if out is not None and store is not None and os.path.abspath(out) == os.path.abspath(store):
+        raise ValueError(f"out must be another file than store, got {out} for both: give another name")
+    _tell_cost(swinging_pendulum(pendulum), max_period, theta1, most_steps)
+    with _work("slices" if theta1 is None else "million steps") as show:
+        if theta1 is not None:
+            found = dpend.find_brake_orbits(
+                pendulum,
+                theta1=_radians("theta1", theta1),
+                max_period=max_period,
+                most_steps=most_steps,
+                progress=lambda done, planned: show(done / 1e6, planned / 1e6),
+            )
+        else:
             found = dpend.find_brake_families(
                 pendulum,
                 max_period=max_period,
                 store=store,
+                most_steps=most_steps,
                 progress=lambda done, planned, families: show(done, planned),
             )
     if out is not None:
@@ -193,7 +208,42 @@ def atlas(
         _print_atlas(found, theta1, out)
     families = all(family["status"] == Status.CONVERGED.name.lower() for family in found.families)
     solved = families and np.all(found.table["status"] == Status.CONVERGED)
-    return 0 if solved and not found.coverage.suspicious_cells else 1
+    return 0 if solved and not (found.coverage.suspicious_cells or found.coverage.exhausted) else 1
+
+
+# A search that is expected to take longer says so before it begins [s].
+_LONG = 60.0
+
+
+def _tell_cost(pendulum: Pendulum, max_period: float, theta1: float | None, most_steps: float) -> None:
+    known_period(pendulum, max_period)
+    if theta1 is None:
+        steps = survey.expected_steps(pendulum, max_period)
+    else:
+        steps = expected_steps(pendulum, max_period, _radians("theta1", theta1))
+    if steps <= most_steps and steps * SECONDS_PER_STEP > _LONG:
+        minutes = math.ceil(steps * SECONDS_PER_STEP / 60)
+        print(f"dpend: this takes about {steps:.1g} time steps, some {minutes} minutes", file=sys.stderr)
+
+
+# Seconds between two lines about a search whose standard error is no terminal.
+_BETWEEN_LINES = 10.0
+
+
+@contextlib.contextmanager
+def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
+    """A progress bar on standard error; where that is no terminal a line now and then."""
+    with _bar(sys.stderr.isatty(), unit) as show:
+        started = last = time.perf_counter()
+
+        def tell(done: float, planned: float) -> None:
+            nonlocal last
+            show(done, planned)
+            if not sys.stderr.isatty() and time.perf_counter() - last > _BETWEEN_LINES:
+                last = time.perf_counter()
+                print(f"dpend: {done:.0f} of about {planned:.0f} {unit}, {last - started:.0f} s", file=sys.stderr)
+
+        yield tell
 
 
 @app.command()
@@ -830,6 +880,8 @@ def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> 
     print(f"{what} and periods of at most {atlas.max_period:g} s", end="; ")
     print(f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, {seen.time_points} times")
     agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
+    if seen.exhausted:
+        print("STOPPED at the most time steps allowed: more is likely to be missing; raise --most-steps")
     print(f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding number {agree}")
     if out is not None:
         print(f"written to {out}")

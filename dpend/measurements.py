@@ -10,6 +10,7 @@ for any l2/l1 and g/l1 at all, or do they only when read in the other unit?
 """
 
 import csv
+import io
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dpend.checks import file_path, numbers
+from dpend.files import read_text
 
 
 class Angles(NamedTuple):
@@ -106,10 +108,9 @@ def load_angles(path: str | Path | Any) -> tuple[np.ndarray, np.ndarray | None, 
 def _rows(path: Path) -> tuple[list[list[str]], list[int]]:
     """The rows of a CSV file that are not blank, and their numbers."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, strict=True)
-            found = [(row, reader.line_num) for row in reader if any(cell.strip() for cell in row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
+        found = [(row, reader.line_num) for row in reader if any(cell.strip() for cell in row)]
+    except (OSError, ValueError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(
             f"data must be a CSV file that can be read, got {path} ({reason}): give another file"

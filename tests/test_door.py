@@ -104,7 +104,7 @@ STATE = kind([None, PAPER, FINE, *PAIRS, *NO_OBJECTS], [RELEASE])
 ONE_STATE = kind([*STATE[0], MANY], [RELEASE])
 SCHEME = kind([None, PAPER, RELEASE, "rk4", *NO_OBJECTS], [FINE])
 PATH = kind([None, *NO_PATHS])
-PROGRESS = kind(NO_FUNCTIONS, [print], none=True)
+PROGRESS = kind(NO_FUNCTIONS, [len], none=True)
 ANY: tuple[list, list] = ([], [])
 
 
@@ -285,14 +285,16 @@ DOORS = {
                                                         "max_period": 1.0},
                               {"pendulum": kind([*ONE_PENDULUM[0], Pendulum(g=0.0)], [PAPER]),
                                "theta1": NUMBER,
-                               "max_period": kind([*POSITIVE[0], 1e3], HALVES)},
-                               "dpend.atlas.returns"),
+                               "max_period": kind([*POSITIVE[0], 1e3], HALVES),
+                               "most_steps": POSITIVE, "progress": PROGRESS},
+                               "dpend.atlas.expected_steps"),
     "find_brake_families": Door(dpend.find_brake_families, {"pendulum": PAPER, "max_period": 1.0},
                                 {"pendulum": kind([*ONE_PENDULUM[0], Pendulum(g=0.0)], [PAPER]),
                                  "max_period": kind([*POSITIVE[0], 1e3], HALVES),
                                  "store": kind([*NO_PATHS, "no/such/place/F.json", "F.txt"],
                                                none=True),
-                                 "progress": PROGRESS}, "dpend.survey.returns"),
+                                 "most_steps": POSITIVE, "progress": PROGRESS},
+                                "dpend.survey.expected_steps"),
     "load_atlas": Door(dpend.load_atlas, {}, {"path": kind([*PATH[0], "F.txt", ".",
                                                             "/no/such/F.json"])}),
     "load_angles": Door(dpend.load_angles, {}, {"path": PATH}),
