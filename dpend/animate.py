@@ -14,7 +14,7 @@ import numpy as np
 from dpend.files import check_place, replacing
 from dpend.pendulum import Pendulum, State, fast_frequency, number, positions
 from dpend.plots import LOWER, UPPER
-from dpend.trajectory import Trajectory, simulate
+from dpend.trajectory import MOST_STEPS, Trajectory, simulate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,8 +33,6 @@ _TRAIL = 0.6
 _PIXELS = 480  # a multiple of 16, as video codecs want it
 # Beyond this a GIF is hundreds of megabytes, and no one waits for it.
 _MOST_FRAMES = 10_000
-# A few seconds of computing for each release.
-_MOST_STEPS = 1e7
 
 
 def motions_for(
@@ -62,10 +60,11 @@ def motions_for(
         )
     frames = math.ceil(count - 1e-9)
     substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
-    if not frames * substeps <= _MOST_STEPS:
+    steps = frames * _SAVED * max(1.0, substeps + 1)
+    if not steps <= MOST_STEPS:
         raise ValueError(
-            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {frames * substeps:.3g}: "
-            "give a shorter one, or another pendulum"
+            f"duration must take at most {MOST_STEPS:,} steps with this pendulum, got {duration:g} s, which takes "
+            f"{steps:.3g}: give a shorter one, or another pendulum"
         )
     every = max(1, math.ceil(substeps))
     step = interval / (_SAVED * every)

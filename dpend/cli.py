@@ -1,32 +1,63 @@
 """The command line: the only module that prints. Angles are in degrees here, and nowhere else but in CSV and JSON.
 
 Exit status 0: done. 1: ran, but some solve failed, or the environment is wrong. 2: bad input, one line on standard
-error. 130: interrupted.
+error. 130: interrupted. 141: nobody reads standard output any more.
 """
 
 import contextlib
 import csv
+import io
 import math
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import numpy as np
 import typer
 
 import dpend
+from dpend._runtime import catch_interrupts, leave_quietly
 from dpend.atlas import pendulum_record
-from dpend.files import check_place, json_text, replacing
+from dpend.files import check_place, json_text, parse_decimal, replacing
 from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
 from dpend.steppers import METHODS
 from dpend.sweeps import check_store
 from dpend.trajectory import Status, Trajectory
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+class _Command(typer.core.TyperCommand):
+    """A command that refuses what no option can mean: one given twice, an empty text, a number that is not finite."""
+
+    # Any: each version of typer has its own class of contexts.
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        for option in self.params:
+            name, times = max(option.opts, key=len), sum(option is one for one in order)
+            if times > 1 and not option.multiple and option.nargs == 1:
+                raise ValueError(f"{name} must be given once at most, got it {times} times: leave out all but one")
+            if "" in _several(given.get(option.name or "")):
+                raise ValueError(f"{name} must not be empty, got '': give a value, or leave {name} out")
+        rest = super().parse_args(ctx, args)
+        for name, value in ctx.params.items():
+            for one in _several(value):
+                if isinstance(one, float) and not math.isfinite(one):
+                    raise ValueError(f"{name} must be a finite number, got {one}: give another {name}")
+        return rest
+
+
+def _several(value: object) -> Sequence[object]:
+    return value if isinstance(value, (list, tuple)) else (value,)
+
 
 app = typer.Typer(
     name="dpend",
@@ -38,17 +69,28 @@ app = typer.Typer(
 
 
 def _number(text: str | float) -> float:  # defaults come as what they are
+    if not isinstance(text, str):
+        return text
+    if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return float(text)  # the command refuses it by the name of its option
     try:
-        return float(text)
+        return parse_decimal(text)
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is not a number: give one like 40 or 1e-3") from None
+        raise typer.BadParameter(f"{text!r:.60} is not a number: give one like 40 or 1e-3") from None
+
+
+# What a count fits in, here and in the compiled programs.
+_LARGEST_INTEGER = 2**63 - 1
 
 
 def _integer(text: str | int) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not an integer: give one like 1") from None
+    if not isinstance(text, str):
+        return text
+    if not re.fullmatch(r"[+-]?\d+", text, re.ASCII):
+        raise typer.BadParameter(f"{text!r:.60} is not an integer: give one like 1")
+    if len(text) > 20 or abs(int(text)) > _LARGEST_INTEGER:
+        raise typer.BadParameter(f"{text!r:.60} is beyond {_LARGEST_INTEGER}: give a smaller one")
+    return int(text)
 
 
 def _numeric(*names: str, help: str) -> Any:
@@ -69,7 +111,7 @@ def _commands() -> None:
     """Keeps `dpend orbit` a subcommand."""
 
 
-@app.command()
+@app.command(cls=_Command)
 def orbit(
     theta1: _Theta1,
     branch: Annotated[
@@ -87,8 +129,11 @@ def orbit(
         ),
     ] = None,
     crossing: Annotated[
-        int, typer.Option(parser=_integer, metavar="INTEGER", help="Which of the branch's passages through theta1.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            parser=_integer, metavar="INTEGER", help="Which of the branch's passages through theta1; 1 if not given."
+        ),
+    ] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -103,10 +148,13 @@ def orbit(
         given, missing = ("theta2", "period") if period is None else ("period", "theta2")
         raise ValueError(f"{missing} must be given with {given}, got {given} alone: a guess is both")
     guess = None if theta2 is None else (_radians("theta2", theta2), number("period", period, positive=True, unit="s"))
+    if crossing is not None and branch is None:
+        raise ValueError(f"crossing must go with branch, got {crossing} alone: give --branch {' or '.join(BRANCHES)}")
+    passage = 1 if crossing is None else crossing
     both = branch is None and guess is None and ratio is None
     found = {
         name: dpend.find_orbit(
-            pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=crossing
+            pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=passage
         )
         for name in (BRANCHES if both else (branch,))
     }
@@ -118,7 +166,7 @@ def orbit(
     return 0 if all(int(orbit.status) == Status.CONVERGED for orbit in found.values()) else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def family(
     branch: Annotated[str, typer.Option(help="in-phase (slow mode) or anti-phase (fast mode).")],
     out: Annotated[
@@ -149,7 +197,7 @@ def family(
     return 0 if int(found.status) == Status.CONVERGED else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def atlas(
     max_period: Annotated[float, _numeric(help="The longest period [s].")],
     theta1: Annotated[
@@ -193,7 +241,7 @@ def atlas(
     return 0 if solved and not found.coverage.suspicious_cells else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def design(
     theta1: _Theta1,
     branch: Annotated[
@@ -226,9 +274,8 @@ def design(
         by_name = dict(zip(branches, orbits, strict=True))
         return jax.numpy.stack([equation(by_name) for equation in equations.values()])
 
-    names = tuple(name.strip() for name in free.split(","))
     found = dpend.design_pendulum(
-        loss, start, names, branch=branches, theta1=_radians("theta1", theta1), bounds=_bounds(bounds or [])
+        loss, start, _names(free), branch=branches, theta1=_radians("theta1", theta1), bounds=_bounds(bounds or [])
     )
     record = _design_record(found, start, branches, tuple(equations))
     if as_json:
@@ -238,7 +285,7 @@ def design(
     return 0 if int(found.status) == Status.CONVERGED else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def simulate(
     theta1: _Theta1,
     theta2: Annotated[float, _numeric(help="Release angle of the lower rod [deg].")],
@@ -276,7 +323,7 @@ def simulate(
     return 0 if int(motion.status) == Status.CONVERGED else 1
 
 
-@app.command(name="map")
+@app.command(name="map", cls=_Command)
 def map_command(
     quantity: Annotated[str, typer.Argument(help="lyapunov, megno, flip or drift.")],
     size: Annotated[str, typer.Option(metavar="N|NxM", help="Cells along theta1 and theta2.")],
@@ -351,7 +398,7 @@ def map_command(
     return 0
 
 
-@app.command()
+@app.command(cls=_Command)
 def animate(
     theta1: Annotated[list[float], _numeric("--theta1", help="Release angle of the upper rod [deg]; once a release.")],
     theta2: Annotated[list[float], _numeric("--theta2", help="Release angle of the lower rod [deg]; once a release.")],
@@ -398,7 +445,7 @@ def animate(
     return 0 if all(int(motion.status) == Status.CONVERGED for motion in motions) else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def fit(
     data: Annotated[Path, typer.Argument(help="A CSV file with columns time_s, theta1_deg, theta2_deg.")],
     free: Annotated[str, typer.Option(help="What to estimate, of l1, l2, m1, m2, g; the rest is held.")] = "l2,m2,g",
@@ -424,7 +471,7 @@ def fit(
         theta1,
         theta2,
         pendulum=Pendulum(l1, l2, m1, m2, g),
-        free=tuple(name.strip() for name in free.split(",") if name.strip()),
+        free=_names(free),
         initial=(None, None, 0.0, 0.0) if at_rest else (None,) * 4,
         noise=sigma,
     )
@@ -455,6 +502,9 @@ def _asked(
         raise ValueError(f"branch must be given with period and kappa, got none: give {' or '.join(BRANCHES)}")
     if branch is not None and branch not in BRANCHES:
         raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    if branch is not None and period is None and kappa is None:
+        raise ValueError(f"branch must go with period or kappa, got {branch!r} with ratio alone, which is of both: "
+                         "leave it out")  # fmt: skip
     equations: dict[str, Callable[[dict[str, PeriodicOrbit]], Any]] = {}
     if period is not None:
         seconds = float(number("period", period, positive=True, unit="s"))
@@ -468,13 +518,20 @@ def _asked(
     return equations, BRANCHES if ratio is not None else (str(branch),)
 
 
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    if "" in names:
+        raise ValueError(f"free must be names with commas between them, got {text!r}: give them like l2,m2")
+    return names
+
+
 def _bounds(texts: list[str]) -> dict[str, tuple[float, float]]:
     """Bounds by name, of theta1 in radians."""
     bounds = {}
     for text in texts:
         name, _, span = text.partition("=")
         try:
-            low, high = (float(part) for part in span.split(":"))
+            low, high = (parse_decimal(part) for part in span.split(":"))
         except ValueError:
             raise ValueError(f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5") from None
         if name in bounds:
@@ -692,8 +749,20 @@ def _print_json(record: dict[str, Any]) -> None:
     print(json_text(record))
 
 
-def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
+# Wider than any table here: a number is never broken to fit a terminal.
+_TABLE_WIDTH = 200
+
+
+def _print_table(table: "Table") -> None:
     from rich.console import Console
+
+    console = Console(width=_TABLE_WIDTH, highlight=False)
+    with console.capture() as text:
+        console.print(table)
+    print(text.get(), end="")
+
+
+def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
     from rich.table import Table
 
     table = Table(title=_described(pendulum), title_justify="left", title_style="")
@@ -714,7 +783,7 @@ def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) ->
         )
         if record["status"] != "converged":
             failures.append(f"{name or 'guess'}: {record['status']}: {record['message']}")
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     for failure in failures:
         print(failure)
 
@@ -724,7 +793,6 @@ _SHOWN_POINTS = 12
 
 
 def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     pendulum = Pendulum(*record["pendulum"].values())
@@ -749,7 +817,7 @@ def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None
             "0" if marginal else f"{row['log_abs_kappa']:.5g}",
             row["kind"],
         )
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     worst = max(point["theta2_error_deg"] for point in points)
     print(f"{len(points)} orbits from {family.ends[0]} to {family.ends[1]}; error of theta2 at most {worst:.0e} deg")
     if int(family.status) != Status.CONVERGED:
@@ -759,7 +827,6 @@ def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None
 
 
 def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title=_described(atlas.pendulum), title_justify="left", title_style="")
@@ -774,7 +841,7 @@ def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> 
         table.add_column(heading, justify="left" if heading in _WORDS else "right")
     for row in rows:
         table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     seen = atlas.coverage
     print(f"{what} and periods of at most {atlas.max_period:g} s", end="; ")
     print(f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, {seen.time_points} times")
@@ -831,7 +898,6 @@ def _described(pendulum: Pendulum) -> str:
 
 
 def _print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, theta1: float) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     branches = (orbit["branch"] for orbit in record["orbits"])
@@ -850,7 +916,7 @@ def _print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, 
         slopes = [orbit["sensitivities"][key][name] for orbit in record["orbits"] for key in _SLOPES]
         row = [f"{float(before):g}", f"{float(after):.10g}", *(f"{slope:.6g}" for slope in slopes)]
         table.add_row(f"{name} ({unit})", *row)
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     missed = ", ".join(f"{name} {value:.0e}" for name, value in record["missed"].items())
     print(f"{record['iterations']} steps, {record['looks']} solves; misses {missed}; logarithms changed by", end=" ")
     print(f"{record['distance']:.6g}" + (f"; at bounds: {', '.join(found.at_bounds)}" if found.at_bounds else ""))
@@ -952,10 +1018,12 @@ def _keep_compiled_code() -> None:
     """Has JAX keep compiled code in the user's cache directory, or where the user chose: later runs start warm."""
     if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         return
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dpend"
+    chosen = os.environ.get("XDG_CACHE_HOME", "")
     try:
+        # A relative path is no place at all: the XDG specification has it ignored.
+        base = Path(chosen if os.path.isabs(chosen) else Path.home() / ".cache") / "dpend"
         base.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # nowhere to write, or a user without a home
         return
     if os.access(base, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(base))
@@ -963,33 +1031,70 @@ def _keep_compiled_code() -> None:
 
 
 def _complain(text: str) -> None:
-    print("dpend: " + " ".join(text.split()), file=sys.stderr)
+    if sys.stderr is not None:  # the shell may have closed it
+        print("dpend: " + " ".join(text.split()), file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The entry point: runs one command and exits with its status."""
-    sys.exit(_run(sys.argv[1:] if arguments is None else list(arguments)))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
+    catch_interrupts()
+    status = _run(sys.argv[1:] if arguments is None else list(arguments))
+    leave_quietly()
+    _let_go_of_output()
+    sys.exit(status)
+
+
+def _let_go_of_output() -> None:
+    """What could not be written is not tried again, with a traceback, while Python ends."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(arguments: list[str]) -> int:
-    # The process is this program's own, so that float64 is ours to switch on even where JAX is to be left plain.
-    if "JAX_ENABLE_X64" not in os.environ:
-        jax.config.update("jax_enable_x64", True)
-    _keep_compiled_code()
     try:
+        # The process is this program's own, so that float64 is ours to switch on even where JAX is to be left plain.
+        if "JAX_ENABLE_X64" not in os.environ:
+            jax.config.update("jax_enable_x64", True)
+        _keep_compiled_code()
         with np.errstate(all="ignore"):  # what overflows is told by the status or by the line that refuses it
-            return int(app(arguments or ["--help"], standalone_mode=False) or 0)
+            status = int(app(arguments or ["--help"], standalone_mode=False) or 0)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return status
     except (KeyboardInterrupt, typer.Abort):
         return 130
+    except BrokenPipeError:
+        return 141
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:
-        # The command line's own errors know how to name the option they are about.
-        usage = getattr(error, "format_message", None)
-        if usage is None and not isinstance(error, (ValueError, OSError, RuntimeError)):
-            raise
-        _complain(usage() if usage else str(error))
-        return 1 if usage is None and isinstance(error, RuntimeError) else 2
+        return _tell(error)
+
+
+def _tell(error: Exception) -> int:
+    """One line about an error, and the exit status; a fault of this program is raised again."""
+    # The command line's own errors know how to name the option they are about.
+    usage = getattr(error, "format_message", None)
+    if usage is not None:
+        _complain(usage())
+        return 2
+    if isinstance(error, MemoryError):
+        _complain(f"there is not enough memory ({error}): give fewer steps, cells or points")
+        return 1
+    if isinstance(error, OSError):
+        where = f"{error.filename}" if error.filename else "a file or standard output"
+        _complain(f"{where} cannot be read or written ({error.strerror or error}): make room, or give another place")
+        return 1
+    if not isinstance(error, (ValueError, RuntimeError)):
+        raise error
+    _complain(str(error))
+    return 1 if isinstance(error, RuntimeError) else 2
 
 
 if __name__ == "__main__":

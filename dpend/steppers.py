@@ -617,15 +617,24 @@ class Scheme:
         """The number of even steps that a motion of `duration` [s] takes: ceil(|duration|/step - 1e-9).
 
         Raises:
-            ValueError: the step is longer than the motion.
+            ValueError: the step is longer than the motion, or so short that they would never end.
         """
         count = abs(duration) / self.step
+        if count > _MOST_STEPS:
+            raise ValueError(
+                f"step must make at most {_MOST_STEPS:.0e} steps, got {self.step:g} s, which makes {count:.3g}: "
+                "give a larger step, or a shorter duration"
+            )
         if 0.0 < count < 1.0 - 1e-9:
             raise ValueError(
                 f"step must not be longer than the motion of {abs(duration):g} s, got {self.step:g}: "
                 "give a smaller step"
             )
         return math.ceil(count - 1e-9)
+
+
+# A week of one motion at two million steps a second: what takes longer does not end.
+_MOST_STEPS = 1e12
 
 
 # The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th percentile over
