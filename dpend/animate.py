@@ -14,7 +14,7 @@ import numpy as np
 from dpend.files import check_place, replacing
 from dpend.pendulum import Pendulum, State, fast_frequency, number, positions
 from dpend.plots import LOWER, UPPER
-from dpend.trajectory import MOST_STEPS, Trajectory, simulate
+from dpend.trajectory import Trajectory, simulate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,6 +33,8 @@ _TRAIL = 0.6
 _PIXELS = 480  # a multiple of 16, as video codecs want it
 # Beyond this a GIF is hundreds of megabytes, and no one waits for it.
 _MOST_FRAMES = 10_000
+# Half a minute of computing for each release; only a few of its states are saved.
+_MOST_STEPS = 10_000_000
 
 
 def motions_for(
@@ -47,7 +49,7 @@ def motions_for(
         Trajectories with equal times. Their status says whether their end may be believed.
     Raises:
         ValueError: duration or speed not positive; a speed at which the motion does not last for a frame; more than
-            10 000 frames, or 1e7 steps.
+            10 000 frames, or 1e7 steps; rates that overflow.
     """
     interval = float(number("speed", speed, positive=True)) / FRAMES_PER_SECOND
     duration = float(number("duration", duration, positive=True, unit="s"))
@@ -60,15 +62,16 @@ def motions_for(
         )
     frames = math.ceil(count - 1e-9)
     substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
-    steps = frames * _SAVED * max(1.0, substeps + 1)
-    if not steps <= MOST_STEPS:
+    steps = frames * _SAVED * (substeps + 1)
+    if not steps <= _MOST_STEPS:
         raise ValueError(
-            f"duration must take at most {MOST_STEPS:,} steps with this pendulum, got {duration:g} s, which takes "
+            f"duration must take at most {_MOST_STEPS:,} steps with this pendulum, got {duration:g} s, which takes "
             f"{steps:.3g}: give a shorter one, or another pendulum"
         )
     every = max(1, math.ceil(substeps))
     step = interval / (_SAVED * every)
-    return [simulate(pendulum, release, frames * interval, step=step, save_every=every) for release in releases]
+    end, most = frames * interval, 2 * _MOST_STEPS
+    return [simulate(pendulum, one, end, step=step, save_every=every, most_steps=most) for one in releases]
 
 
 def film(

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import jax
 import numpy as np
@@ -29,7 +29,7 @@ from dpend.orbits import BRANCHES, PeriodicOrbit
 from dpend.pendulum import Pendulum, State, number
 from dpend.steppers import METHODS
 from dpend.sweeps import check_store
-from dpend.trajectory import Status, Trajectory
+from dpend.trajectory import MOST_STEPS, Status, Trajectory
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -152,12 +152,13 @@ def orbit(
         raise ValueError(f"crossing must go with branch, got {crossing} alone: give --branch {' or '.join(BRANCHES)}")
     passage = 1 if crossing is None else crossing
     both = branch is None and guess is None and ratio is None
-    found = {
-        name: dpend.find_orbit(
-            pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=passage
-        )
-        for name in (BRANCHES if both else (branch,))
-    }
+    with _clock("following the branch" if guess is None else "solving"):
+        found = {
+            name: dpend.find_orbit(
+                pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=passage
+            )
+            for name in (BRANCHES if both else (branch,))
+        }
     records = [_orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()]
     if as_json:
         _print_json({"orbits": records} if both else records[0])
@@ -185,7 +186,8 @@ def family(
     formats = {".csv": _write_family_csv, ".json": _write_json}
     if out is not None:
         check_place("out", out, tuple(formats))
-    found = dpend.follow_family(Pendulum(l1, l2, m1, m2, g), branch)
+    with _clock("following the family"):
+        found = dpend.follow_family(Pendulum(l1, l2, m1, m2, g), branch)
     record = _family_record(found, branch)
     if out is not None:
         with replacing(out) as draft:
@@ -219,11 +221,13 @@ def atlas(
         raise ValueError(f"store goes with the whole square, got {store} with theta1: leave out either")
     if out is not None:
         check_place("out", out, (".csv", ".json"))
+        if store is not None and out.resolve() == store.resolve():
+            raise ValueError(f"out must be another file than store, got {out} for both: give another name")
     pendulum = Pendulum(l1, l2, m1, m2, g)
     if theta1 is not None:
         found = dpend.find_brake_orbits(pendulum, theta1=_radians("theta1", theta1), max_period=max_period)
     else:
-        with _bar(sys.stderr.isatty(), "slices") as show:
+        with _bar(_is_terminal(sys.stderr), "slices") as show:
             found = dpend.find_brake_families(
                 pendulum,
                 max_period=max_period,
@@ -274,15 +278,19 @@ def design(
         by_name = dict(zip(branches, orbits, strict=True))
         return jax.numpy.stack([equation(by_name) for equation in equations.values()])
 
-    found = dpend.design_pendulum(
-        loss, start, _names(free), branch=branches, theta1=_radians("theta1", theta1), bounds=_bounds(bounds or [])
-    )
+    names, limits, angle = _names(free), _bounds(bounds or []), _radians("theta1", theta1)
+    with _clock("designing"):
+        found = dpend.design_pendulum(loss, start, names, branch=branches, theta1=angle, bounds=limits)
     record = _design_record(found, start, branches, tuple(equations))
     if as_json:
         _print_json(record)
     else:
         _print_design(found, record, start, theta1)
     return 0 if int(found.status) == Status.CONVERGED else 1
+
+
+# Of a motion at order 8 with its second pass, all states saved, on two cores.
+_STEPS_A_SECOND, _BYTES_A_STEP = 5e4, 250
 
 
 @app.command(cls=_Command)
@@ -300,6 +308,9 @@ def simulate(
     tolerance: Annotated[
         float | None, _numeric(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
     ] = None,
+    most_steps: Annotated[
+        int, typer.Option(parser=_integer, metavar="INTEGER", help="How many steps are taken at most.")
+    ] = MOST_STEPS,
     out: Annotated[Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -312,7 +323,14 @@ def simulate(
     pendulum = Pendulum(l1, l2, m1, m2, g)
     state = State(_radians("theta1", theta1), _radians("theta2", theta2), number("p1", p1), number("p2", p2))
     write = _writer(out) if out is not None else None
-    motion = dpend.simulate(pendulum, state, duration, step=step, method=method, tolerance=tolerance)
+    if step is not None and step > 0 and MOST_STEPS < abs(duration / step) <= most_steps:
+        seconds = abs(duration / step) / _STEPS_A_SECOND
+        _complain(f"{abs(duration / step):,.0f} steps take some {seconds / 60:.0f} minutes and "
+                  f"{_BYTES_A_STEP * seconds * _STEPS_A_SECOND / 1e9:.0f} GB")  # fmt: skip
+    with _clock("integrating"):
+        motion = dpend.simulate(
+            pendulum, state, duration, step=step, method=method, tolerance=tolerance, most_steps=most_steps
+        )
     if write is not None:
         write(motion)
     record = _motion_record(motion)
@@ -359,7 +377,7 @@ def map_command(
     if figure is not None:
         check_place("figure", figure, (".png",))
     started, counts = time.perf_counter(), [0, 0, 0]
-    with _bar(sys.stderr.isatty(), "cells") as show:
+    with _bar(_is_terminal(sys.stderr), "cells") as show:
 
         def tell(*now: int) -> None:
             counts[:] = now
@@ -426,7 +444,7 @@ def animate(
         for one, two in zip(theta1, theta2, strict=True)
     ]
     motions = animation.motions_for(pendulum, releases, duration, speed=speed)
-    with _bar(sys.stderr.isatty(), "frames") as show:
+    with _bar(_is_terminal(sys.stderr), "frames") as show:
         frames = animation.film(pendulum, motions, out, progress=show)
     records = [_motion_record(motion) for motion in motions]
     record = {
@@ -464,17 +482,21 @@ def fit(
     """The pendulum whose motion is nearest to measured angles, from a guess of it; one rod or single cells may lack."""
     if figure is not None:
         check_place("figure", figure, (".png",))
+        if figure.resolve() == data.resolve():
+            raise ValueError(f"figure must be another file than data, got {figure} for both: give another name")
     sigma = None if noise is None else math.radians(number("noise", noise, positive=True, unit="deg"))
+    names = _names(free)
     times, theta1, theta2 = dpend.load_angles(data)
-    found = dpend.fit_parameters(
-        times,
-        theta1,
-        theta2,
-        pendulum=Pendulum(l1, l2, m1, m2, g),
-        free=_names(free),
-        initial=(None, None, 0.0, 0.0) if at_rest else (None,) * 4,
-        noise=sigma,
-    )
+    with _clock("fitting"):
+        found = dpend.fit_parameters(
+            times,
+            theta1,
+            theta2,
+            pendulum=Pendulum(l1, l2, m1, m2, g),
+            free=names,
+            initial=(None, None, 0.0, 0.0) if at_rest else (None,) * 4,
+            noise=sigma,
+        )
     if figure is not None:
         _draw_fit(found, figure)
     record = _fit_record(found)
@@ -554,7 +576,7 @@ _MOST_CELLS = 65536
 
 def _size(text: str) -> tuple[int, int]:
     sides = text.lower().split("x")
-    if len(sides) > 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
+    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", side) and int(side) for side in sides):
         raise ValueError(f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like 512x256")
     cells = int(sides[0]), int(sides[-1])
     if max(cells) > _MOST_CELLS:
@@ -572,6 +594,10 @@ def _cells(name: str, text: str, count: int) -> np.ndarray:
         raise ValueError(f"{name} must be a range A:B with A below B, got {text!r}: give one like -180:180")
     centres = np.radians(start + (np.arange(count) + 0.5) * ((end - start) / count))
     return 0.5 * (centres - centres[::-1]) if start == -end else centres
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    return stream is not None and stream.isatty()
 
 
 @contextlib.contextmanager
@@ -596,6 +622,21 @@ def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
             progress.update(task, completed=done, total=total, rate=f"{millions:.1f} M steps/s" if steps else "")
 
         yield show
+
+
+@contextlib.contextmanager
+def _clock(doing: str) -> Iterator[None]:
+    """What is being done and for how long, on a terminal: for what cannot tell how far it is."""
+    if not _is_terminal(sys.stderr):
+        yield
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = SpinnerColumn(), TextColumn(doing), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        progress.add_task("", total=None)
+        yield
 
 
 # --- what is printed -------------------------------------------------------------------------------------------------
@@ -1040,6 +1081,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
+    os.environ.pop("MPLBACKEND", None)  # for windows, of which the program opens none
     catch_interrupts()
     status = _run(sys.argv[1:] if arguments is None else list(arguments))
     leave_quietly()

@@ -75,8 +75,8 @@ def load_angles(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, np.nda
 
     Raises:
         ValueError: a file that cannot be read, a missing or repeated column, a cell that is no finite number, times
-            that do not increase, fewer than 7 angles of a rod, angles that look like radians; with the row, counted from the
-            header, which is row 1.
+            that do not increase, fewer than 7 angles of a rod, angles that look like radians; with the row, counted
+            from the header, which is row 1.
     """
     path = Path(path)
     rows, lines = _rows(path)

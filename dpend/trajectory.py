@@ -46,8 +46,8 @@ class Status(IntEnum):
 
 _MESSAGES = {
     Status.CONVERGED: "Converged.",
-    Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations, or a motion did not come to its "
-    "end in the allowed steps; try a closer guess, or a shorter motion.",
+    Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations, or a motion did not come to "
+    "its end in the allowed steps; try a closer guess, or a shorter motion.",
     Status.SINGULAR: "The equations are singular here, as at a fold of the family, or where data do not determine what "
     "is asked; try another release angle, or hold what has no finite standard error.",
     Status.LEFT_BRANCH: "The branch could not be followed to this release: no step was short enough to stay on it, or "
@@ -383,9 +383,9 @@ def _weakly_float64(leaf: Any) -> Any:
 # In one step a rod may turn, and the fast mode advance, by this much [rad]: beyond it neither method resolves the
 # motion, whatever the energy says.
 _LARGEST_TURN = 1.0
-# Steps of a motion, if nobody asks for more: some ten seconds at order 8 with the second pass, and 1 GB where all their
-# states are saved.
-MOST_STEPS = 10_000_000
+# Steps of a motion, if nobody asks for more: half a minute at order 8 with the second pass and all states saved, and
+# half a gigabyte.
+MOST_STEPS = 2_000_000
 # The same of `reference`, whose steps take 20 microseconds: half a minute.
 _MOST_ADAPTIVE_STEPS = 1_000_000
 # An error of this many radians is no small error: the computed motion has parted from the true one.
@@ -669,7 +669,8 @@ def reference(
 ) -> Trajectory:
     """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's integrators.
 
-    It takes as many steps as it needs, up to `most_steps`. The error estimate is the change when the tolerance is ten times larger.
+    It takes as many steps as it needs, up to `most_steps`. The error estimate is the change when the tolerance is ten
+    times larger.
 
     Arguments:
         pendulum, state: leaves are scalars; `state` holds at t = 0.
