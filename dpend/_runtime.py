@@ -57,7 +57,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 def _tell_in_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     if issubclass(kind, (RuntimeError, ValueError, OSError)):
-        print("dpend: " + " ".join(str(error).split()), file=sys.stderr)
+        sys.stderr.write("dpend: " + " ".join(str(error).split()) + "\n")
     else:
         sys.__excepthook__(kind, error, trace)
 
@@ -138,11 +138,10 @@ def _check_flags() -> None:
         return
     said = re.search(r"^F.*parse_flags_from_env[^]]*\] *(.*)", asked.stderr, re.MULTILINE)
     if asked.returncode != 0 and said:
-        known = re.search(r"Unknown flags? in XLA_FLAGS: (.*)", said[1])
-        wrong = known[1].strip() if known else flags.strip()
-        reason = "" if known else f" ({said[1].strip()})"
+        unknown = re.search(r"Unknown flags? in XLA_FLAGS: (.*)", said[1])
+        wrong = unknown[1].strip() if unknown else flags.strip()
         raise RuntimeError(
-            f"XLA_FLAGS must hold flags and values that the installed XLA knows, got {wrong!r:.200}{reason:.200}: "
+            f"XLA_FLAGS must hold flags and values that the installed XLA knows, got {wrong!r:.200}: "
             "take them out of the environment"
         )
 

@@ -65,7 +65,7 @@ def motions_for(
     steps = frames * _SAVED * (substeps + 1)
     if not steps <= _MOST_STEPS:
         raise ValueError(
-            f"duration must take at most {_MOST_STEPS:,} steps with this pendulum, got {duration:g} s, which takes "
+            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {duration:g} s, which takes "
             f"{steps:.3g}: give a shorter one, or another pendulum"
         )
     every = max(1, math.ceil(substeps))

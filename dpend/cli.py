@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import numpy as np
@@ -48,10 +48,14 @@ class _Command(typer.core.TyperCommand):
             if "" in _several(given.get(option.name or "")):
                 raise ValueError(f"{name} must not be empty, got '': give a value, or leave {name} out")
         rest = super().parse_args(ctx, args)
-        for name, value in ctx.params.items():
-            for one in _several(value):
+        for option in self.params:
+            unit = re.search(r"( \[[^]]+\]|)[^]]*$", getattr(option, "help", None) or "")
+            for one in _several(ctx.params.get(option.name or "")):
                 if isinstance(one, float) and not math.isfinite(one):
-                    raise ValueError(f"{name} must be a finite number, got {one}: give another {name}")
+                    raise ValueError(
+                        f"{option.name} must be a finite number{unit[1] if unit else ''}, got {one}: "
+                        f"give another {option.name}"
+                    )
         return rest
 
 
@@ -227,7 +231,7 @@ def atlas(
     if theta1 is not None:
         found = dpend.find_brake_orbits(pendulum, theta1=_radians("theta1", theta1), max_period=max_period)
     else:
-        with _bar(_is_terminal(sys.stderr), "slices") as show:
+        with _bar(_on_terminal(), "slices") as show:
             found = dpend.find_brake_families(
                 pendulum,
                 max_period=max_period,
@@ -368,6 +372,8 @@ def map_command(
     """A map of the square of releases from rest: chaos, first flips or energy drift, cell by cell."""
     if quantity not in _MAPS:
         raise ValueError(f"map must be one of {', '.join(_MAPS)}, got {quantity!r}")
+    if method is not None and method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     duration = number("duration", duration, positive=True, unit="s")
     axes = {
         key: _cells(key, text, count)
@@ -377,7 +383,7 @@ def map_command(
     if figure is not None:
         check_place("figure", figure, (".png",))
     started, counts = time.perf_counter(), [0, 0, 0]
-    with _bar(_is_terminal(sys.stderr), "cells") as show:
+    with _bar(_on_terminal(), "cells") as show:
 
         def tell(*now: int) -> None:
             counts[:] = now
@@ -444,7 +450,7 @@ def animate(
         for one, two in zip(theta1, theta2, strict=True)
     ]
     motions = animation.motions_for(pendulum, releases, duration, speed=speed)
-    with _bar(_is_terminal(sys.stderr), "frames") as show:
+    with _bar(_on_terminal(), "frames") as show:
         frames = animation.film(pendulum, motions, out, progress=show)
     records = [_motion_record(motion) for motion in motions]
     record = {
@@ -576,7 +582,7 @@ _MOST_CELLS = 65536
 
 def _size(text: str) -> tuple[int, int]:
     sides = text.lower().split("x")
-    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", side) and int(side) for side in sides):
+    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,99}", side) and int(side) for side in sides):
         raise ValueError(f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like 512x256")
     cells = int(sides[0]), int(sides[-1])
     if max(cells) > _MOST_CELLS:
@@ -596,8 +602,8 @@ def _cells(name: str, text: str, count: int) -> np.ndarray:
     return 0.5 * (centres - centres[::-1]) if start == -end else centres
 
 
-def _is_terminal(stream: TextIO | None) -> bool:
-    return stream is not None and stream.isatty()
+def _on_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()
 
 
 @contextlib.contextmanager
@@ -627,7 +633,7 @@ def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
 @contextlib.contextmanager
 def _clock(doing: str) -> Iterator[None]:
     """What is being done and for how long, on a terminal: for what cannot tell how far it is."""
-    if not _is_terminal(sys.stderr):
+    if not _on_terminal():
         yield
         return
     from rich.console import Console
@@ -1085,17 +1091,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     catch_interrupts()
     status = _run(sys.argv[1:] if arguments is None else list(arguments))
     leave_quietly()
-    _let_go_of_output()
+    if not _output_is_open():  # Python would try once more when it ends, and say so with a traceback
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(status)
 
 
-def _let_go_of_output() -> None:
-    """What could not be written is not tried again, with a traceback, while Python ends."""
+def _output_is_open() -> bool:
+    """Whether what was printed could be written."""
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
 
 
 def _run(arguments: list[str]) -> int:
@@ -1129,11 +1137,10 @@ def _tell(error: Exception) -> int:
     if isinstance(error, MemoryError):
         _complain(f"there is not enough memory ({error}): give fewer steps, cells or points")
         return 1
-    if isinstance(error, OSError):
-        where = f"{error.filename}" if error.filename else "a file or standard output"
-        _complain(f"{where} cannot be read or written ({error.strerror or error}): make room, or give another place")
+    if isinstance(error, OSError) and not _output_is_open():
+        _complain(f"standard output cannot be written ({error.strerror or error}): make room, or give another place")
         return 1
-    if not isinstance(error, (ValueError, RuntimeError)):
+    if not isinstance(error, (ValueError, OSError, RuntimeError)):
         raise error
     _complain(str(error))
     return 1 if isinstance(error, RuntimeError) else 2
