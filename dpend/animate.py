@@ -34,8 +34,8 @@ _TRAIL = 0.6
 _PIXELS = 480  # a multiple of 16, as video codecs want it
 # Beyond this a GIF is hundreds of megabytes, and no one waits for it.
 _MOST_FRAMES = 10_000
-# A few seconds of computing for each release.
-_MOST_STEPS = 1e7
+# Half a minute of computing for each release; only a few of its states are saved.
+_MOST_STEPS = 10_000_000
 
 
 def motions_for(
@@ -50,7 +50,7 @@ def motions_for(
         Trajectories with equal times. Their status says whether their end may be believed.
     Raises:
         ValueError: duration or speed not positive; a speed at which the motion does not last for a frame; more than
-            10 000 frames, or 1e7 steps.
+            10 000 frames, or 1e7 steps; rates that overflow.
     """
     if not isinstance(releases, Sequence) or isinstance(releases, (str, bytes)):
         raise ValueError(f"releases must be a sequence of states, got {shown(releases)}: give one like [state]")
@@ -69,14 +69,16 @@ def motions_for(
         )
     frames = math.ceil(count - 1e-9)
     substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
-    if not frames * substeps <= _MOST_STEPS:
+    steps = frames * _SAVED * (substeps + 1)
+    if not steps <= _MOST_STEPS:
         raise ValueError(
-            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {frames * substeps:.3g}: "
-            "give a shorter one, or another pendulum"
+            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {duration:g} s, which takes "
+            f"{steps:.3g}: give a shorter one, or another pendulum"
         )
     every = max(1, math.ceil(substeps))
     step = interval / (_SAVED * every)
-    return [simulate(pendulum, release, frames * interval, step=step, save_every=every) for release in releases]
+    end, most = frames * interval, 2 * _MOST_STEPS
+    return [simulate(pendulum, one, end, step=step, save_every=every, most_steps=most) for one in releases]
 
 
 def film(

@@ -4,6 +4,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import stat
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -126,3 +127,18 @@ def json_text(record: dict[str, Any], indent: int | None = 2) -> str:
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     return json.dumps(clean(record), indent=indent, allow_nan=False)
+
+
+# Decimal numbers as people write them. Python reads more: 1_000, digits of other scripts, nan.
+_DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+def parse_decimal(text: str) -> float:
+    """The number that a text says in decimal digits; infinity where it is beyond the largest double.
+
+    Raises:
+        ValueError: any other text.
+    """
+    if not _DECIMAL.fullmatch(text):
+        raise ValueError(f"{text!r:.60} is not a number")
+    return float(text)

@@ -143,7 +143,7 @@ def _candidates(problem: Problem, start: _Start, settings: Settings, windows: in
         np.pad(cost.reshape(grid[0].shape), ((1, 1), (0, 0)), "wrap"), ((0, 0), (1, 1)), constant_values=np.inf
     )
     lowest = np.min(np.lib.stride_tricks.sliding_window_view(table, (3, 3)), axis=(2, 3)).ravel() >= cost
-    order = np.argsort(np.where(lowest, cost, np.inf))[: min(_STARTS, int(np.sum(lowest)))]
+    order = np.argsort(np.where(lowest, cost, np.inf))[: min(_STARTS, max(int(np.sum(lowest)), 1))]
     return [Point(first[:, i : i + 1], fields) for i in order]
 
 
@@ -274,7 +274,7 @@ def _is_bounded(
         )
         nodes = found.point.nodes + np.tensordot(way, found.step.response, 1)
         aside = solved(shifted, Point(nodes, np.zeros(others.shape[1])), settings)
-        grown = (aside.misses.squares - found.misses.squares) / max(noise, 1e-300) ** 2
+        grown = (aside.misses.squares - found.misses.squares) / max(noise, _LEAST_NOISE) ** 2
         if aside.step is not None and grown < _GROWN:
             return False
     return True
@@ -396,7 +396,8 @@ def fit_parameters(
             "g must not start at 0 where it is free, got 0: give its sign and size by a start above or below"
         )
     held = _checked_initial(initial)
-    sigma = None if noise is None else known_number("noise", noise, positive=True, unit="rad")
+    sigma = None if noise is None else _checked_noise(noise)
+    _check_shape(numbers)
     series = checked(times, theta1, theta2)
     unknowns = len(names) + held.count(None)
     count = int(np.sum(np.isfinite(series.values)))
@@ -421,6 +422,33 @@ def _checked_free(free: Any) -> tuple[str, ...]:
     return names
 
 
+# Angles of a radian are rounded by this much [rad], and no motion in doubles is known to less.
+_LEAST_NOISE = 1e-15
+# Of two lengths or masses: beyond this ratio what the lighter or shorter does is lost in rounding, or it overflows.
+_MOST_UNEQUAL = 1e9
+
+
+def _checked_noise(noise: Any) -> float:
+    sigma = float(known_number("noise", noise, positive=True, unit="rad"))
+    if not _LEAST_NOISE <= sigma <= math.pi:
+        raise ValueError(
+            f"noise must be from {_LEAST_NOISE:g} rad, where doubles round, to pi rad, half a turn, "
+            f"got {sigma:.3g} rad ({math.degrees(sigma):.3g} deg): give that of one angle, or none"
+        )
+    return sigma
+
+
+def _check_shape(pendulum: Pendulum) -> None:
+    """Refuses a start from which no search can go on: ratios that doubles cannot hold beside 1."""
+    for over, under in (("l2", "l1"), ("m2", "m1")):
+        ratio = float(getattr(pendulum, over)) / float(getattr(pendulum, under))
+        if not 1 / _MOST_UNEQUAL <= ratio <= _MOST_UNEQUAL:
+            raise ValueError(
+                f"pendulum must have {over}/{under} from {1 / _MOST_UNEQUAL:g} to {_MOST_UNEQUAL:g}, got {ratio:.3g}: "
+                f"give another {over} or {under}"
+            )
+
+
 def _checked_initial(initial: Any) -> tuple[float | None, ...]:
     values = several("initial", initial, f"{', '.join(INITIAL)}", len(INITIAL))
     return tuple(
@@ -436,7 +464,7 @@ def _fitted(
     by_free = np.array([_BY_FIELD[name] for name in free], float).reshape(-1, 3).T
     problem = laid_out(series, pendulum, by_free, np.array([value is not None for value in initial]), rate)
     start = _smoothed(problem, *series, initial, rate)
-    expected = sigma or start.noise
+    expected = sigma or max(start.noise, _LEAST_NOISE)
     seen_at_first = bool(np.all(start.known[:, 0]))
     searches = [(_window_by_window, first) for first in (_FIRST[:1] if seen_at_first else _FIRST)]
     if np.mean(np.all(start.known, axis=0)) > _MOSTLY:
@@ -466,6 +494,11 @@ def _rate(series: Angles, pendulum: Pendulum) -> float:
         if np.any(there := np.isfinite(column))
     ]
     rate = max(swing, float(np.max(turning)) / _FASTER, 1 / (times[-1] - times[0]))
+    if not math.isfinite(rate):
+        raise ValueError(
+            f"times and pendulum must give finite rates, got l1 = {pendulum.l1:g} m, "
+            f"g = {pendulum.g:g} m/s^2 and times {times[-1] - times[0]:.3g} s long: give SI units"
+        )
     spacing = float(np.median(np.diff(times)))
     if spacing * rate > _COARSEST:
         raise ValueError(

@@ -619,10 +619,16 @@ class Scheme:
         """The number of even steps that a motion of `duration` [s] takes: ceil(|duration|/step - 1e-9).
 
         Raises:
-            ValueError: the step is longer than the motion; the duration is no known finite number.
+            ValueError: the step is longer than the motion, or so short that they would never end; the duration is no
+                known finite number.
         """
         duration = known_number("duration", duration, unit="s")
         count = abs(duration) / self.step
+        if count > _MOST_STEPS:
+            raise ValueError(
+                f"step must make at most {_MOST_STEPS:.0e} steps, got {self.step:g} s, which makes {count:.3g}: "
+                "give a larger step, or a shorter duration"
+            )
         if 0.0 < count < 1.0 - 1e-9:
             raise ValueError(
                 f"step must not be longer than the motion of {abs(duration):g} s, got {self.step:g}: "
@@ -638,6 +644,10 @@ def check_scheme(scheme: Any) -> None:
         ValueError: another class, a method's name among them.
     """
     instance("scheme", scheme, Scheme, 'dpend.Scheme("rk8", 1e-3) or dpend.scheme_for(pendulum, 1e-9)')
+
+
+# A week of one motion at two million steps a second: what takes longer does not end.
+_MOST_STEPS = 1e12
 
 
 # The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th percentile over

@@ -69,7 +69,8 @@ class Status(IntEnum):
 
 _MESSAGES = {
     Status.CONVERGED: "Converged.",
-    Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations; try a closer guess.",
+    Status.MAX_ITERATIONS: "Newton's method did not converge in the allowed iterations, or a motion did not come to "
+    "its end in the allowed steps; try a closer guess, or a shorter motion.",
     Status.SINGULAR: "The equations are singular here, as at a fold of the family, or where data do not determine what "
     "is asked; try another release angle, or hold what has no finite standard error.",
     Status.LEFT_BRANCH: "The branch could not be followed to this release: no step was short enough to stay on it, or "
@@ -397,8 +398,11 @@ def _weakly_float64(leaf: Any) -> Any:
 # In one step a rod may turn, and the fast mode advance, by this much [rad]: beyond it neither method resolves the
 # motion, whatever the energy says.
 _LARGEST_TURN = 1.0
-# 3 GB of saved states.
-_MOST_SAVED = 100_000_000
+# Steps of a motion, if nobody asks for more: half a minute at order 8 with the second pass and all states saved, and
+# half a gigabyte.
+MOST_STEPS = 2_000_000
+# The same of `reference`, whose steps take 20 microseconds: half a minute.
+_MOST_ADAPTIVE_STEPS = 1_000_000
 # An error of this many radians is no small error: the computed motion has parted from the true one.
 _PARTED = 0.1
 
@@ -513,6 +517,7 @@ def simulate(
     save_every: int | Any = 1,
     error: bool | Any = True,
     drift_tolerance: float | Any | None = None,
+    most_steps: int | Any = MOST_STEPS,
 ) -> Trajectory:
     """The motion from `state` over `duration`, with an estimate of its own error.
 
@@ -534,12 +539,14 @@ def simulate(
             tolerance the search has made it: the estimate is the worst at any step, saved or not.
         drift_tolerance: largest energy drift, in units of the energy scale, that passes. By default 1e-6 for a step,
             far above what a method loses at a sensible one; for a tolerance any, the error itself being known.
+        most_steps: how many steps are taken at most. A step that makes more is refused; for a tolerance no shorter one
+            is tried then.
     Returns:
         Trajectory.
     Raises:
         ValueError: duration zero or not finite, both step and tolerance given, no step where the state or the pendulum
-            is traced, a step not positive or longer than the motion, an unknown method, save_every below 1, more than
-            1e8 states to save.
+            is traced, a step not positive or longer than the motion, an unknown method, save_every below 1, more
+            steps than `most_steps`.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -552,6 +559,7 @@ def simulate(
         )
     at_most_one(step=step, tolerance=tolerance)
     save_every, error = integer("save_every", save_every), flag("error", error)
+    most_steps = integer("most_steps", most_steps)
     method = ("rk8-circle" if step is None else "rk8") if method is None else one_of("method", method, tuple(METHODS))
     if drift_tolerance is None:
         drift_tolerance = math.inf if step is None else 1e-6
@@ -568,14 +576,14 @@ def simulate(
             raise ValueError("tolerance needs a state and a pendulum that are known, got traced ones: give a step")
         tolerance = known_number("tolerance", 1e-9 if tolerance is None else tolerance, positive=True, unit="rad")
         wanted = np.float64(_MARGIN * tolerance)
-        scheme, estimate = _scheme_reaching(pendulum, state, known, method, wanted)
+        scheme, estimate = _scheme_reaching(pendulum, state, known, method, wanted, most_steps)
     else:
         scheme, estimate = Scheme(method, step), None if error else math.nan
     steps = scheme.steps(known)
-    if steps // save_every > _MOST_SAVED:
+    if steps > most_steps:
         raise ValueError(
-            f"step must leave at most {_MOST_SAVED:,} states to save, got {scheme.step:g} s, which makes "
-            f"{steps // save_every:,}: give a larger step or save_every, or a shorter duration"
+            f"step must make at most {most_steps:,} steps, got {scheme.step:g} s, which makes {steps:,}: "
+            "give a larger step, a shorter duration, or more most_steps"
         )
     every = min(save_every, steps)
     time = jnp.asarray(duration, jnp.float64)
@@ -603,19 +611,19 @@ _ONLY_ROUNDING = 1e-18
 
 
 def _scheme_reaching(
-    pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float
+    pendulum: Pendulum, state: State, duration: float, method: str, tolerance: float, most_steps: int
 ) -> tuple[Scheme, float]:
-    """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding allows,
-    and that error.
+    """The method with a step at which the error of this motion is below `tolerance`, or as small as rounding or
+    `most_steps` allow, and that error.
     """
     rate = float(_fastest_of_all(pendulum, state))
     if not math.isfinite(rate):
         return Scheme(method, abs(duration)), math.nan  # whatever the step, the status will say so
     steps = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN))
-    if steps > _MOST_SAVED:
+    if steps > most_steps:
         raise ValueError(
-            f"duration must be at most some {_FIRST_TURN * _MOST_SAVED / rate:.1e} s for a tolerance, "
-            f"got {duration:g}: give a shorter one, or a step"
+            f"duration must be at most some {_FIRST_TURN * most_steps / rate:.1e} s for a tolerance, got {duration:g}, "
+            f"which takes {steps:.3g} steps or more: give a shorter one, a step, or more most_steps"
         )
     while True:
         scheme = Scheme(method, abs(duration) / steps)
@@ -624,6 +632,8 @@ def _scheme_reaching(
             return scheme, error
         missing = (2 * error / tolerance) ** (1 / scheme.order) if math.isfinite(error) else 4.0
         steps = math.ceil(steps * min(max(missing, 1.2), 4.0))
+        if steps > most_steps:
+            return scheme, error
 
 
 @jax.jit
@@ -668,10 +678,12 @@ def reference(
     *,
     tolerance: float | Any = 1e-13,
     error: bool | Any = True,
+    most_steps: int | Any = _MOST_ADAPTIVE_STEPS,
 ) -> Trajectory:
     """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's integrators.
 
-    It takes as many steps as it needs. The error estimate is the change when the tolerance is ten times larger.
+    It takes as many steps as it needs, up to `most_steps`. The error estimate is the change when the tolerance is ten
+    times larger.
 
     Arguments:
         pendulum, state: leaves are scalars; `state` holds at t = 0.
@@ -679,16 +691,25 @@ def reference(
         tolerance: relative and absolute, of angles [rad] and of momenta in units of the motion's own inertia and rate;
             1e-13 is the least that rounding leaves room for.
         error: make the second solution. Without it `error_estimate` is NaN.
+        most_steps: how many steps are taken at most; each number has a program of its own.
     Returns:
-        Trajectory, its `steps` those of the better solution; status `NONFINITE` where diffrax gave up.
+        Trajectory, its `steps` those of the better solution; status `MAX_ITERATIONS` where that would be more than
+            `most_steps`, `NONFINITE` where diffrax gave up otherwise.
     Raises:
-        ValueError: times empty, not finite, not monotonic or on both sides of zero; tolerance not positive.
+        ValueError: times empty, not finite, not monotonic or on both sides of zero; tolerance below 1e-13.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
     check_motion(pendulum, state)
     error, tolerance = flag("error", error), number("tolerance", tolerance, positive=True)
     single("tolerance", tolerance)
+    most_steps = integer("most_steps", most_steps)
+    known = known_value(tolerance)
+    if known is not None and not known >= _LEAST_TOLERANCE:
+        raise ValueError(
+            f"tolerance must be at least {_LEAST_TOLERANCE:g}, which rounding leaves room for, got {known:g}: "
+            "give a larger tolerance"
+        )
     grid = np.atleast_1d(numbers("times", times, unit="s"))
     if grid.ndim != 1:
         raise ValueError(f"times must have one dimension, got shape {grid.shape}: give one number for each time")
@@ -701,17 +722,22 @@ def reference(
     if not grid.size or not np.all(np.isfinite(grid)) or not ordered:
         raise ValueError(f"times must be finite and move away from zero in one direction, got {shown(grid)}: sort them")
     state = _float64(state)
-    states, steps, done = _dopri8(pendulum, state, jnp.asarray(grid), tolerance)
+    states, steps, done = _dopri8(pendulum, state, jnp.asarray(grid), tolerance, most_steps)
     estimate = jnp.asarray(jnp.nan)
     if error:
-        estimate = _angle_error(states, _dopri8(pendulum, state, jnp.asarray(grid), 10 * tolerance)[0])
+        estimate = _angle_error(states, _dopri8(pendulum, state, jnp.asarray(grid), 10 * tolerance, most_steps)[0])
     with_start = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), state, states)
-    status = jnp.where(done, Status.CONVERGED, Status.NONFINITE)
+    lost = jnp.where(steps < most_steps, Status.NONFINITE, Status.MAX_ITERATIONS)
+    status = jnp.where(done, Status.CONVERGED, lost)
     return Trajectory(jnp.asarray(grid), states, _drift(pendulum, with_start), estimate, steps, status)
 
 
-@jax.jit
-def _dopri8(pendulum, state, times, tolerance):  # type: ignore[no-untyped-def]
+# Below this the rounding of a step is more than the error that its size is chosen by: all are taken back for ever.
+_LEAST_TOLERANCE = 1e-13
+
+
+@partial(jax.jit, static_argnames="most_steps")
+def _dopri8(pendulum, state, times, tolerance, most_steps):  # type: ignore[no-untyped-def]
     """States at `times`, steps taken, and whether diffrax succeeded."""
     import diffrax
 
@@ -737,7 +763,7 @@ def _dopri8(pendulum, state, times, tolerance):  # type: ignore[no-untyped-def]
         args=pendulum,
         saveat=diffrax.SaveAt(ts=times),
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, dtmin=1e-12 / rate),
-        max_steps=None,
+        max_steps=most_steps,
         throw=False,
     )
     states = jax.tree.map(jnp.multiply, solution.ys, unit)

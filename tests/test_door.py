@@ -95,6 +95,7 @@ FIELD = kind(NO_NUMBERS, [*HALVES, *ONES, np.array([1.0, 2.0]), jnp.ones(2), np.
 POSITIVE_FIELD = kind([*NO_NUMBERS, *NOT_POSITIVE, np.array([0.1, 0.0]), jnp.asarray([0.1, -0.2])],
                       FIELD[1])
 COUNT = kind([*NO_INTEGERS, 0, -1, np.int64(0), np.array(-2), jnp.asarray(0)], ONES)
+BUDGET = kind(COUNT[0], [10**6, np.int64(10**6), jnp.asarray(10**6)])
 FLAG = kind(NO_FLAGS, [True, False, np.True_, np.False_])
 PAIRS = [(0.5, 0.7), np.array([1.0, 2.0])]
 PENDULUM = kind([None, RELEASE, FINE, *PAIRS, *NO_OBJECTS], [PAPER])
@@ -224,7 +225,7 @@ DOORS = {
                                                                                 ["rk4",
                                                                                     np.str_("rk8")],
                                                                                         none=True),
-                      "save_every": COUNT, "error": FLAG, "drift_tolerance": MAYBE_POSITIVE,
+                      "save_every": COUNT, "most_steps": BUDGET, "error": FLAG, "drift_tolerance": MAYBE_POSITIVE,
                       "tolerance": kind(POSITIVE[0][1:])}, "dpend.trajectory._simulate"),
     "simulate, for a tolerance": Door(dpend.simulate, {"pendulum": PAPER, "state": RELEASE,
                                                        "duration": 1.0},
@@ -232,7 +233,8 @@ DOORS = {
                                       "dpend.trajectory._scheme_reaching"),
     "reference": Door(dpend.reference, {"pendulum": PAPER, "state": RELEASE, "times": [1.0]},
                       {"pendulum": ONE_PENDULUM, "state": ONE_STATE, "times": GRID,
-                       "tolerance": POSITIVE, "error": FLAG},
+                       "tolerance": POSITIVE, "error": FLAG,
+                       "most_steps": BUDGET},
                       "dpend.trajectory._dopri8"),
     "first_crossing": Door(dpend.first_crossing, {"functions": watched, **QUANTITY},
                            {**MOTION, "functions": kind([None, *NO_FUNCTIONS], [watched]),
