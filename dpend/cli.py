@@ -78,7 +78,7 @@ app = typer.Typer(
 )
 
 
-def _number(text: str | float) -> float:  # defaults come as what they are
+def _number(text: str | float | int) -> float:  # defaults come as what they are
     if not isinstance(text, str):
         return text
     if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):

@@ -100,8 +100,8 @@ def find_brake_families(
     """
     require_float64()
     fixed = swinging_pendulum(pendulum)
-    max_period = known_period(fixed, max_period)
     most_steps = known_number("most_steps", most_steps, positive=True)
+    max_period = known_period(fixed, max_period)
     path = None if store is None else file_path("store", store)
     if progress is not None:
         function("progress", progress, "(slices done, slices planned, families)", "print")
