@@ -136,6 +136,9 @@ def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
         (("out", "."), "out must be a Zarr store of a sweep or a new name, got .:"),
         (("method", "rk4"), "step must be given with method"),
         (("error", "all"), "error must be None or"),
+        (("duration", "1e6"), "duration and step must leave at most 1e+06 steps to one motion"),
+        (("l1", "1e-300"), "duration and step must leave at most 1e+06 steps to one motion"),
+        (("most-steps", "1e3"), "duration and step must leave at most 0.001 steps to one motion and 1e+03 to all"),
     ],
 )
 def test_bad_maps_are_refused_in_one_line(capsys, tmp_path, change, text):
@@ -145,6 +148,25 @@ def test_bad_maps_are_refused_in_one_line(capsys, tmp_path, change, text):
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert text in err
     assert not (tmp_path / "m.zarr").exists()
+
+
+def test_a_damaged_map_is_mended_and_a_long_one_told(capsys, tmp_path, monkeypatch):
+    """One line each on standard error; the result is what it was."""
+    monkeypatch.setattr(cli, "_LONG", 0.0)
+    command = ("map", "flip", "--size", "8", "--duration", "1", "--out", tmp_path / "m.zarr")
+    status, _, err = run(capsys, *command)
+    assert (status, err.count("\n")) == (0, 1)
+    assert err.startswith("dpend: 32 cells to compute, about 1.5e+03 steps, which may take 0 minutes, and values of")
+    chunk = tmp_path / "m.zarr" / "flip_time" / "c" / "0" / "0"
+    right = chunk.read_bytes()
+    chunk.write_bytes(right[:-1])
+    monkeypatch.setattr(cli, "_LONG", 60.0)
+    status, _, err = run(capsys, *command)
+    assert (status, chunk.read_bytes()) == (0, right)
+    assert err == (
+        f"dpend: store {tmp_path / 'm.zarr'} is damaged: flip_time/c/0/0 has other bytes than were written; "
+        "what is damaged is made again, 1 of 4 tiles\n"
+    )
 
 
 def test_map_names_are_checked(capsys, tmp_path):
