@@ -59,9 +59,9 @@ def motion(orbit):
 
 
 @jax.jit
-def monodromy(orbit, part):
-    """The derivative of the flow over `part` of the period, in one piece of 1600 steps."""
-    return transition(orbit.pendulum, orbit.state, part * orbit.period / 1600, 1600, dpend.Scheme("rk8", 1.0))[1]
+def monodromy(orbit, part, steps=1600):
+    """The derivative of the flow over `part` of the period, in one piece of so many steps."""
+    return transition(orbit.pendulum, orbit.state, part * orbit.period / steps, steps, dpend.Scheme("rk8", 1.0))[1]
 
 
 @pytest.mark.parametrize("branch", BOTH)
@@ -107,12 +107,12 @@ def assert_special_points_are_what_they_say(family):
     points, names = family.special_points, {point.kind for point in family.special_points}
     for point in points:
         where, error = (float(number) for number in point.error_estimate)
-        assert 0 < where < 1e-3
+        assert 0 < where < (0.1 if says(point.kind) is None else 1e-3), point.kind
         if says(point.kind) is None:
             continue
         kappa, unsure = in_one_piece(point.orbit)
         told = point.kind, where, error, float(point.orbit.kappa), kappa, unsure
-        assert error < 1e-3, told
+        assert error < 1e-2, told
         assert abs(point.orbit.kappa - says(point.kind)) <= error, told
         assert abs(kappa - says(point.kind)) <= error + unsure, told
     for kind in names:
@@ -126,12 +126,9 @@ def assert_special_points_are_what_they_say(family):
     kinds = [point.kind for point in changes]
     assert all(kind != other for kind, other in itertools.pairwise(kinds)), kinds
     assert_signs_change(family, changes, 1 - np.asarray(family.orbits.kappa), 1e-9)
-    for point in changes:
-        after = np.flatnonzero(family.arclength > point.arclength + point.error_estimate[0])
-        before = np.flatnonzero(family.arclength < point.arclength - point.error_estimate[0])
-        at = {"stability_lost": before, "stability_gained": after}[point.kind]
-        if len(at):
-            assert family.orbits.kappa[at[-1 if point.kind == "stability_lost" else 0]] < 1 + 1e-9
+    for first in changes[:1]:  # the others alternate
+        before = np.asarray(family.orbits.kappa)[family.arclength < first.arclength - first.error_estimate[0]]
+        assert np.all((before < 1 + 1e-9) == (first.kind == "stability_lost"))
 
 
 def assert_signs_change(family, points, values, tolerance):
@@ -147,18 +144,19 @@ def assert_signs_change(family, points, values, tolerance):
 
 
 def in_one_piece(orbit):
-    """kappa of a centred orbit from Phi(T/4), and what a release and a period rounded at 1e-14 leave of it."""
+    """kappa of a centred orbit from Phi(T/4), and what rounding leaves of it: three times the scatter of four numbers
+    of steps and releases 1e-14 apart.
+    """
 
-    def kappa(theta2, period):
-        state = dataclasses.replace(orbit.state, theta2=theta2)
-        quarter = np.asarray(monodromy(dataclasses.replace(orbit, state=state, period=period), 0.25))
-        c = 1 - 2 * np.sum(quarter[:2, :2] * quarter[2:, 2:])
-        return 2 * c**2 - 1, float(growth_of(quarter[None], "centred"))
+    def kappa(steps, shift):
+        moved = dataclasses.replace(orbit.state, theta2=orbit.theta2 + shift)
+        quarter = np.asarray(monodromy(dataclasses.replace(orbit, state=moved), 0.25, steps))
+        growths.append(float(growth_of(quarter[None], "centred")))
+        return 2 * (1 - 2 * np.sum(quarter[:2, :2] * quarter[2:, 2:])) ** 2 - 1
 
-    theta2, period = float(orbit.theta2), float(orbit.period)
-    here, grown = kappa(theta2, period)
-    moves = kappa(theta2 + 1e-12, period)[0] - here, kappa(theta2, period * (1 + 1e-12))[0] - here
-    return here, 1e-2 * np.sum(np.abs(moves)) + 4e-13 * grown
+    growths = []
+    here, *others = (kappa(*how) for how in ((1600, 0.0), (1200, 1e-14), (2000, -1e-14), (2400, 0.0)))
+    return here, 3 * np.max(np.abs(np.array(others) - here)) + 4e-13 * growths[0]
 
 
 def test_a_touch_a_fold_and_a_crossing_close_together():
