@@ -47,7 +47,7 @@ def kept(paper, tmp_path_factory):
             raise Stop
 
     with pytest.raises(Stop):
-        dpend.find_brake_families(paper, max_period=0.6, store=store, progress=stop)
+        dpend.find_brake_families(paper, max_period=0.9, store=store, progress=stop)
     return store.read_text()
 
 
@@ -92,7 +92,7 @@ SETTINGS = "store must have been made with the same settings, got .*"
         (lambda text: text.replace('"lost": 0', '"lost": NaN', 1), WROTE + "NaN is no JSON number"),
         (lambda text: text.replace('"lost"', '"lost": 0, "lost"', 1), WROTE + "'lost' stands twice"),
         (changed("slices", 1, value=...), WROTE + "it was changed since, or damaged"),
-        (changed("slices", 1, "returns", 0, 1, value=0.55), WROTE + "it was changed since"),
+        (changed("slices", 1, "returns", 0, 1, value=0.75), WROTE + "it was changed since"),
         (changed("slices", 1, "degree", value=7), WROTE + "it was changed since"),
         (changed("slices", 1, "degree", value=True), WROTE + r"slices\[1\].degree must be an integer, is True"),
         (changed("slices", 1, "degree", value="1"), WROTE + r"slices\[1\].degree must be an integer"),
@@ -103,8 +103,8 @@ SETTINGS = "store must have been made with the same settings, got .*"
         (changed("families", 0, "level", value=3), WROTE + "it was changed since"),
         (changed("families", 0, "seed", value=None), WROTE + r"families\[0\].seed must be a list"),
         (changed("checksum", value=...), WROTE + "the store has no checksum"),
-        (changed("settings", "max_period", value=0.7), WROTE + "it was changed since"),
-        (forged("settings", "max_period", value=0.7), SETTINGS + "with max_period 0.7"),
+        (changed("settings", "max_period", value=0.8), WROTE + "it was changed since"),
+        (forged("settings", "max_period", value=0.8), SETTINGS + "with max_period 0.8"),
         (forged("settings", "pendulum", "l1", value=0.3), SETTINGS + "with pendulum"),
         (forged("settings", value={}), SETTINGS + "with dpend_version None"),
         (forged("settings", "more", value=1), SETTINGS + "with more 1"),
@@ -120,7 +120,7 @@ def test_a_damaged_store_is_refused(paper, kept, tmp_path, damage, said):
     store = tmp_path / "damaged.json"
     store.write_text(damage(kept))
     with pytest.raises(ValueError, match=said) as refusal:
-        dpend.find_brake_families(paper, max_period=0.6, store=store)
+        dpend.find_brake_families(paper, max_period=0.9, store=store)
     assert "\n" not in str(refusal.value)
     assert store.read_text() == damage(kept)
 
