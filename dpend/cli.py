@@ -824,7 +824,8 @@ def _motion_record(motion: Trajectory) -> dict[str, Any]:
         "method": motion.scheme.name,
         "step_s": abs(float(motion.time[-1])) / int(motion.steps),
         "status": status.name.lower(),
-        "message": dpend.message(status),
+        "tolerance": float(motion.tolerance),
+        "message": motion.message,
     }
 
 

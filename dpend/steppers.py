@@ -136,14 +136,25 @@ _WRITTEN_OUT = 4
 
 
 def explicit_step(
-    tableau: Tableau, increment: Callable[[Point], Point], point: Point, *, written_out: bool = True
+    tableau: Tableau,
+    increment: Callable[[Point], Point],
+    point: Point,
+    *,
+    written_out: bool = True,
+    onto: Point | None = None,
 ) -> Point:
-    """One step of an explicit Runge-Kutta method, where increment(point) is the slope at a point times the step."""
+    """One step of an explicit Runge-Kutta method.
+
+    Arguments:
+        increment: increment(point) is the slope at a point times the step.
+        onto: what the step is added to, by default the point itself.
+    """
+    base = point if onto is None else onto
     if written_out:
         slopes: list[Point] = []
         for row in tableau.a:
             slopes.append(increment(_displaced(point, row, slopes)))
-        return _displaced(point, tableau.b, slopes)
+        return _displaced(base, tableau.b, slopes)
     # Rows, one for each number that a leaf holds for each lane, so that a stage is one pass over contiguous lanes.
     leaves, structure = jax.tree.flatten(point)
     lanes = min((jnp.shape(leaf) for leaf in leaves), key=len)
@@ -165,7 +176,7 @@ def explicit_step(
         return lax.dynamic_update_index_in_dim(slopes, rows(increment(tree(here))), index, 0)
 
     slopes_table = lax.fori_loop(0, stages, stage, jnp.zeros((stages, *start.shape)))
-    return tree(sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=start))
+    return tree(sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=rows(base)))
 
 
 def _displaced(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Point:
@@ -557,6 +568,22 @@ class Scheme:
         increment = _circle_increment if self._circle else _canonical_increment
         tableau = METHODS[self.name].tableau
         return explicit_step(tableau, partial(increment, constants), point, written_out=not self._rolled)
+
+    def move_compensated(self, constants: Any, point: Point, rest: Point) -> tuple[Point, Point]:
+        """The point one step later, the rounding errors of its sums kept (compensated summation).
+
+        Arguments:
+            rest: what rounding has taken from the sums so far, zeros at the start; the same tree as the point.
+        Returns:
+            The point and the rest, which together are the motion.
+        """
+        if self._implicit:
+            return self.move(constants, point), rest  # its points hold a rest of their own
+        increment = partial(_circle_increment if self._circle else _canonical_increment, constants)
+        tableau = METHODS[self.name].tableau
+        change = explicit_step(tableau, increment, point, written_out=not self._rolled, onto=rest)
+        ahead = jax.tree.map(jnp.add, point, change)
+        return ahead, jax.tree.map(lambda old, new, change: (old - new) + change, point, ahead, change)
 
     def move_tangents(self, constants: Any, point: Point, tangents: State) -> tuple[Point, State]:
         """One step of a point together with tangent vectors of it.

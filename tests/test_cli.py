@@ -196,7 +196,8 @@ def test_what_did_not_converge_says_why(capsys):
     assert (status, orbit["status"]) == (1, "no_such_orbit")
     assert "largest" in orbit["message"]
     status, motion = run_json(capsys, "simulate", "--theta1", 170, "--theta2", 180, "--duration", 20, "--step", 0.002)
-    assert (status, motion["status"]) == (1, "beyond_horizon")
+    assert (status, motion["status"], motion["tolerance"]) == (1, "beyond_horizon", None)
+    assert f"{motion['error_estimate']:.1e} rad, is above 0.1 rad" in motion["message"]
 
 
 def test_nan_and_infinity_are_null(capsys):
