@@ -266,7 +266,7 @@ def _orbits(problem: Problem, rows: Corrected, targets: Any = None, along: Any =
         iterations=rows.iterations.astype(int),
         turns=(whole[:, 0], whole[:, 1]),
         error_estimate=(
-            np.maximum(rows.angle_error, np.finfo(float).eps * np.abs(rows.point[:, 1])),
+            np.maximum(rows.theta2_error, np.finfo(float).eps * np.abs(rows.point[:, 1])),
             np.maximum(rows.time_error, np.finfo(float).eps) * period,
         ),
         status=np.where(rows.converged > 0, int(Status.CONVERGED), int(Status.MAX_ITERATIONS)),
