@@ -700,9 +700,10 @@ def simulate(
     if not Scheme(method, 1.0).even:
         raise ValueError(f"method must take even steps to save states at, got {method!r}: give rk8-circle, or use flow")
     state = _float64(state)
-    compared: _Comparison | None  # None is made beside the motion
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, state)))
+    compared = None  # is made beside the motion
     if step is None:
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, state))):
+        if traced:
             raise ValueError("tolerance needs a state and a pendulum that are known, got traced ones: give a step")
         tolerance = known_number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad")
         scheme, compared = _scheme_reaching(pendulum, state, known, method, tolerance, most_steps)
@@ -717,6 +718,8 @@ def simulate(
         )
     every = min(save_every, steps)
     time = jnp.asarray(duration, jnp.float64)
+    if compared is None and not traced:  # by the one program for all numbers of steps
+        compared = _compare(pendulum, state, step_size(known, steps), jnp.asarray(steps), _any_step(scheme))
     if step is not None:
         return _simulate(pendulum, state, time, steps, scheme, every, None, compared, tolerance, drift_tolerance)
     # The number of steps being this motion's own, a program that were compiled for it would be used once.

@@ -151,7 +151,7 @@ def test_what_went_wrong_is_a_status(paper):
     assert status(paper, State(jnp.nan * jnp.ones(()), 0.0, 0.0, 0.0), 1.0) == Status.NONFINITE
     chaotic = dpend.released(np.radians(170), np.pi)
     assert status(paper, chaotic, 20.0, tolerance=1e-6) == Status.BEYOND_HORIZON
-    assert status(paper, RELEASE, 20.0, tolerance=1e-15) == Status.TOLERANCE_NOT_REACHED
+    assert status(paper, dpend.released(0.3, 0.2), 2.0, tolerance=1e-15) == Status.TOLERANCE_NOT_REACHED
     assert status(paper, RELEASE, 1.0, step=5e-3, error=False) == Status.CONVERGED
     assert len({dpend.message(member) for member in Status}) == len(Status)
 
@@ -168,7 +168,7 @@ def test_the_sentence_tells_the_estimate_and_the_wish(paper):
     )
     enough = float(motion.message.split("tolerance of ")[-1].split(" rad")[0])
     assert dpend.simulate(paper, hard, 7.5, tolerance=enough).message == "Converged."
-    tame = dpend.simulate(paper, RELEASE, 20.0, tolerance=1e-15)
+    tame = dpend.simulate(paper, dpend.released(0.3, 0.2), 2.0, tolerance=1e-15)
     assert "is above the tolerance of 1e-15 rad: no step brings it lower; ask for a tolerance of" in tame.message
     drifted = dpend.simulate(paper, hard, 20.0, step=2e-3)
     assert "is above 0.1 rad, where it has parted from the true motion" in drifted.message
@@ -200,20 +200,29 @@ def test_a_tolerance_holds_on_the_whole_square(paper, duration, tolerance):
     assert passed >= (99 if tolerance > 1e-9 or duration < 5.0 else 85)
 
 
+# Each was passed as right by version 0.1.0 or on the way from it, 2.5 to 7 times the tolerance or estimate off.
+SHORT_AND_LIGHT = Pendulum(0.2, 0.0034391523589411225, 0.1, 0.0011697266598131191)
+HIDDEN = [
+    (Pendulum(), (2.4800729058617197, -0.4855839947738212), 2.0, 1e-11),
+    (Pendulum(), (1.8431335863742246, -1.1399816116213168), 5.0, 1e-10),
+    (SHORT_AND_LIGHT, (-0.9589484415305338, 1.7714192154162474), 2.297582076291769, 2.3129797700696147e-09),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("release", [(2.480121, -0.485633), (-0.958948, 1.771419), (1.843129, -1.139974)])
-def test_rounding_errors_do_not_hide(paper, release):
-    """The estimate by long double, where rounding is most of the error and two passes may come close by chance."""
+@pytest.mark.parametrize(("pendulum", "release", "duration", "tolerance"), HIDDEN)
+def test_errors_do_not_hide(pendulum, release, duration, tolerance):
+    """A truncation error may cancel a displaced start's, and two sums of rounding errors may come close by chance."""
     if not extended.is_extended():
         pytest.skip("long double is double here")
-    for pendulum in (paper, Pendulum(0.2, 3.44e-3, 0.1, 1.17e-3)):
-        motion = dpend.simulate(pendulum, dpend.released(*release), 1.5, tolerance=1e-12)
-        numbers = [float(leaf) for leaf in jax.tree.leaves(pendulum)]
-        exact = extended.motion(numbers, (*release, 0.0, 0.0), np.asarray(motion.time)[-1:], longest=1e-3)[-1]
-        error = max(
-            abs(float(motion.state.theta1[-1] - float(exact[0]))), abs(float(motion.state.theta2[-1]) - float(exact[1]))
-        )
-        assert error < 1.3 * motion.error_estimate
+    motion = dpend.simulate(pendulum, dpend.released(*release), duration, tolerance=tolerance)
+    rows = np.linspace(1, motion.time.size - 1, 20).astype(int)
+    numbers = [float(leaf) for leaf in jax.tree.leaves(pendulum)]
+    exact = extended.motion(numbers, (*release, 0.0, 0.0), np.asarray(motion.time)[rows], longest=2e-3)
+    ours = np.stack([np.asarray(motion.state.theta1)[rows], np.asarray(motion.state.theta2)[rows]], axis=1)
+    error = float(np.max(np.abs(ours - exact[:, :2])))
+    assert error < 1.25 * motion.error_estimate
+    assert motion.status != Status.CONVERGED or error <= tolerance
 
 
 def random_pendulum(random):
