@@ -591,10 +591,9 @@ def _with_extrema(track: _Track, samples: _Samples) -> _Samples:
         before, here, after = h[:-2], h[1:-1], h[2:]
         highest, lowest = (here >= before) & (here >= after), (here <= before) & (here <= after)
         sense = np.where(highest, 1.0, np.where(lowest, -1.0, 0.0))
-        # A parabola's vertex lies beyond the highest of three even points by an eighth of their range at most.
-        room = 0.5 * np.maximum(np.abs(before - here), np.abs(after - here))
-        beyond = sense[:, None] * (targets - here[:, None])
-        (near,) = np.nonzero((sense != 0) & np.any((beyond >= 0) & (beyond <= room[:, None]), axis=1))
+        (near,) = np.nonzero(
+            (sense != 0) & (_in_reach(h, sense, targets) | _in_reach(np.sinh(h), sense, np.sinh(targets)))
+        )
         triples += [(function, samples.where[i : i + 3].copy(), h[i : i + 3] * sense[i], sense[i]) for i in near]
     more = []
     for _ in range(_VERTICES if triples else 0):
@@ -604,6 +603,18 @@ def _with_extrema(track: _Track, samples: _Samples) -> _Samples:
         for j, (function, place, height, sense) in enumerate(triples):
             _narrow(place, height, spots[j], sense * function(some_of(rows, slice(j, j + 1)))[0])
     return _merged(samples, *more)
+
+
+def _in_reach(h: np.ndarray, sense: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Of points between two others, the highest or lowest of the three: whether the function may get to a target.
+
+    A parabola's vertex lies beyond the highest of three even points by an eighth of their range at most.
+    """
+    before, here, after = h[:-2], h[1:-1], h[2:]
+    with np.errstate(invalid="ignore"):  # beyond any float
+        room = 0.5 * np.maximum(np.abs(before - here), np.abs(after - here))
+        beyond = sense[:, None] * (targets - here[:, None])
+        return np.asarray(np.any((beyond >= 0) & (beyond <= room[:, None]), axis=1))
 
 
 def _vertex(place: np.ndarray, height: np.ndarray) -> float:

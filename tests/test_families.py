@@ -144,7 +144,7 @@ def assert_signs_change(family, points, values, tolerance):
 
 
 def in_one_piece(orbit):
-    """kappa of a centred orbit from Phi(T/4), and what rounding leaves of it: three times the scatter of four numbers
+    """kappa of a centred orbit from Phi(T/4), and what rounding leaves of it: ten times the scatter of four numbers
     of steps and releases 1e-14 apart.
     """
 
@@ -156,7 +156,7 @@ def in_one_piece(orbit):
 
     growths = []
     here, *others = (kappa(*how) for how in ((1600, 0.0), (1200, 1e-14), (2000, -1e-14), (2400, 0.0)))
-    return here, 3 * np.max(np.abs(np.array(others) - here)) + 4e-13 * growths[0]
+    return here, 10 * np.max(np.abs(np.array(others) - here)) + 4e-13 * growths[0]
 
 
 def test_a_touch_a_fold_and_a_crossing_close_together():
@@ -439,6 +439,19 @@ def test_orbits_are_not_held_twice(paper):
     assert family.ends == ("branch point", "longest period")
     np.testing.assert_allclose(family.orbits.period[-1], 2.6, rtol=1e-12)
     assert np.all(np.diff(family.orbits.period) > 0)
+
+
+@pytest.mark.slow
+def test_a_dip_between_two_orbits_is_looked_into(paper):
+    """Brake orbits with kappa = 63, 17 and 234 one after the other: between them it falls below -1 and comes back."""
+    orbit = dpend.find_orbit(paper, np.radians(81.55118), guess=(np.radians(-113.608201545), 1.647422305))
+    family = dpend.follow_family(paper, orbit, longest_period=2.0)
+    kinds = [p.kind for p in family.special_points if p.kind.startswith("stability")]
+    assert np.min(family.orbits.kappa) > 10
+    assert kinds == ["stability_gained", "stability_lost"] * 2 or kinds == ["stability_lost", "stability_gained"] * 2
+    for p in family.special_points:
+        if p.kind.startswith("stability"):
+            np.testing.assert_allclose(abs((np.trace(monodromy(p.orbit, 1.0)) - 2) / 2), 1, atol=1e-6)
 
 
 def test_families_up_to_a_period(unit):
