@@ -403,8 +403,7 @@ def _remove(path: Path) -> None:
 
 
 def _sync_up(root: Path, name: str) -> None:
-    """Waits until a file and the directories above it are on the disk."""
-    _sync(root / name)
+    """Waits until the directories above a file are on the disk."""
     for above in Path(name).parents:
         _sync(root / above)
 

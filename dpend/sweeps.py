@@ -482,7 +482,7 @@ class _Work:
         first, self.cells, self.steps = not self.steps, self.cells + cells, self.steps + steps
         if self.tell is not None:
             self.tell(self.cells, self.all, self.steps)
-        if first and cells and self.cost.each is None:
+        if first and steps and self.cost.each is None:
             self.cost = replace(self.cost, each=steps / cells)
             self._check(self.most_steps * _SHARE)
 

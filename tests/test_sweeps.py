@@ -170,6 +170,7 @@ def test_a_store_that_cannot_be_written_to_is_read_if_it_is_finished(paper, tmp_
 def test_an_unfinished_store_is_finished_with_the_same_bytes(paper, tmp_path, monkeypatch):
     """Stopped at every tile in turn, one of them between its values and its status."""
     monkeypatch.setattr(sweeps, "_TILE", 7)
+    monkeypatch.setattr(stores, "_sync", lambda place: None)
     axes = {"theta1": SIDE, "theta2": SIDE}
     dpend.sweep(FLIP, paper, axes, store=tmp_path / "whole.zarr")
     write, stopped, tries = stores.Store._write_chunk, tmp_path / "stopped.zarr", 0
