@@ -47,9 +47,8 @@ SYMMETRIES = ("centred", "brake")
 _RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
 # No number is better known than this, relative to itself.
 _LAST_BIT = sys.float_info.epsilon
-# How many units in the last place of its coordinates, times sqrt(1 + m2/m1), rounding in each step amounts to. Measured
-# against long double (experiments/orbit_errors.py): no error is then above ten times its estimate, the median is a tenth
-# to a third of it.
+# How many units in the last place of its coordinates, times sqrt(1 + m2/m1), the rounding of a step amounts to.
+# Measured against long double (experiments/orbit_errors.py), which shows the quantiles of estimate over error.
 _ROUNDINGS = 2.0
 # A state on the way whose rounding was a displacement of the start by more than so many units in the last place no
 # longer matters to where the root is, and its square would drown what does.
@@ -79,8 +78,9 @@ class PeriodicOrbit:
         log_abs_kappa: log |kappa|, natural.
         dual: the state at T/2, the other rest of the orbit.
         turns: theta(T/4)/pi of a centred orbit, two integers; zeros otherwise.
-        error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s]: the change on solving again at half
-            the step; NaN if that was not asked for.
+        error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s], theta1 taken as it is: the change
+            on solving again at half the step, and what the rounding of the motion makes of them; NaN if that was not
+            asked for.
         status: a value of `Status`.
         symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from rest), or `odd`
             (x(T/2) = -x(0) up to full turns, never at rest; found by `follow_family`).
@@ -230,7 +230,11 @@ def _rounding(pendulum: Pendulum, line: _Line, shot: _Shot) -> Float[Array, "2"]
     takes any change of the equations.
     """
     by_start = _newton_update(line, shot.jacobian, shot.by_start)
-    return _ROUNDINGS * jnp.sqrt(1 + pendulum.m2 / pendulum.m1) * jnp.sqrt(jnp.maximum(jnp.diagonal(by_start @ shot.rounding @ by_start.T), 0.0))
+    return (
+        _ROUNDINGS
+        * jnp.sqrt(1 + pendulum.m2 / pendulum.m1)
+        * jnp.sqrt(jnp.maximum(jnp.diagonal(by_start @ shot.rounding @ by_start.T), 0.0))
+    )
 
 
 def _newton(
@@ -722,7 +726,7 @@ def _first_rest(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scal
             tries=keep(0, s.tries + 1),
             before=(s.ahead, slope),
             next=(after, after_slope),
-            fastest=jnp.fmax(s.fastest, keep(rates_of(after), 0.0)),
+            fastest=jnp.fmax(s.fastest, jnp.where(onto_next, rates_of(after), 0.0)),
             end=here,
             found=rest,
         )
