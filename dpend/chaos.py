@@ -266,9 +266,7 @@ def _upright(pendulum: Pendulum, state: State) -> tuple[Scalar, Scalar]:
 
     def wave(theta: Scalar) -> Scalar:
         turn = theta / (4 * math.pi)
-        value = 0.25 - jnp.abs(turn - jnp.round(turn))
-        # A release at pi in floating point is a release at pi.
-        return jnp.where(jnp.abs(value) < 1e-15, 0.0, value)
+        return 0.25 - jnp.abs(turn - jnp.round(turn))
 
     return wave(state.theta1), wave(state.theta2)
 

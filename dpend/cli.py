@@ -80,7 +80,7 @@ app = typer.Typer(
 
 def _number(text: str | float | int) -> float:  # defaults come as what they are
     if not isinstance(text, str):
-        return text
+        return float(text)
     if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
         return float(text)  # the command refuses it by the name of its option
     try:
