@@ -164,7 +164,7 @@ def atlas(
     ] = None,
     most_steps: Annotated[
         float, _numeric(help="Refuse a search that takes more time steps, or stop there: 1e9 take about an hour.")
-    ] = MOST_STEPS,
+    ] = float(MOST_STEPS),
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -225,7 +225,7 @@ def _tell_cost(pendulum: Pendulum, max_period: float, theta1: float | None, most
 
 
 # Seconds between two lines about a search whose standard error is no terminal.
-_BETWEEN_LINES = 10.0
+_BETWEEN_LINES = 15.0
 
 
 @contextlib.contextmanager
@@ -239,7 +239,7 @@ def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
             show(done, planned)
             if not sys.stderr.isatty() and time.perf_counter() - last > _BETWEEN_LINES:
                 last = time.perf_counter()
-                print(f"dpend: {done:.0f} of about {planned:.0f} {unit}, {last - started:.0f} s", file=sys.stderr)
+                print(f"dpend: {done:.3g} of about {planned:.3g} {unit}, {last - started:.0f} s", file=sys.stderr)
 
         yield tell
 
