@@ -43,8 +43,9 @@ _INTERVALS, _MOST_REFINEMENTS = 128, 6
 MOST_STEPS, STEPS_PER_ORBIT, SECONDS_PER_STEP = 300_000_000, 10_000, 4e-6
 # Larger numbers are not counted.
 COUNTABLE = 10**18
-# Powers of ten. A lower bob of 1e-200 of the upper one's mass takes products of momenta below what float64 holds.
-_FARTHEST, _FARTHEST_UNIT = 30, 90
+# Powers of ten. A lower bob of 1e-200 of the upper one's mass takes products of momenta below what float64 holds;
+# with a lower rod of 1e-28 of the upper one its own momentum is lost in what the upper one adds to it.
+_FARTHEST_MASSES, _FARTHEST_LENGTHS, _FARTHEST_UNIT = 30, 12, 90
 # A scan looks this share further than asked, so that an orbit of just the longest period lies inside.
 BEYOND = 1e-3
 
@@ -128,8 +129,8 @@ class Atlas:
             if bounds is not None:
                 low, high = _range(name, bounds)
                 keep &= (self.table[name] >= low) & (self.table[name] <= high)
-        names = {one["family"] for one in self.families}
-        for name, wanted, known in (("symmetry", symmetry, set(SYMMETRIES)), ("family", family, names)):
+        names = [one["family"] for one in self.families]
+        for name, wanted, known in (("symmetry", symmetry, list(SYMMETRIES)), ("family", family, names)):
             if wanted is not None:
                 given = list(wanted) if isinstance(wanted, (list, tuple, set)) else [wanted]
                 chosen = [one_of(name, one, sorted(known)) for one in given]
@@ -357,12 +358,12 @@ def known_period(pendulum: Pendulum, max_period: Any) -> float:
 def _check_scales(pendulum: Pendulum) -> None:
     """Refuses a pendulum whose numbers are so far apart that their products leave the range of float64."""
     l1, l2, m1, m2, g = (math.log10(float(getattr(pendulum, name))) for name in ("l1", "l2", "m1", "m2", "g"))
-    for names, ratio in (("l1 and l2", l2 - l1), ("m1 and m2", m2 - m1)):
-        if abs(ratio) > _FARTHEST:
+    for names, ratio, most in (("l1 and l2", l2 - l1, _FARTHEST_LENGTHS), ("m1 and m2", m2 - m1, _FARTHEST_MASSES)):
+        if abs(ratio) > most:
             values = " and ".join(f"{float(getattr(pendulum, name)):g}" for name in names.split(" and "))
             raise ValueError(
-                f"{names} must be within a factor of 1e{_FARTHEST} of each other, beyond which their products leave "
-                f"the range of float64, got {values}: give others"
+                f"{names} must be within a factor of 1e{most} of each other, beyond which float64 loses the momenta, "
+                f"got {values}: give others"
             )
     units = {"sqrt(l1/g)": 0.5 * (l1 - g), "m1 g l1": m1 + g + l1, "m1 l1 sqrt(g l1)": m1 + 1.5 * l1 + 0.5 * g}
     for name, size in units.items():

@@ -221,7 +221,7 @@ def atlas(
     ] = None,
     most_steps: Annotated[
         float, _numeric(help="Refuse a search that takes more time steps, or stop there: 1e9 take about an hour.")
-    ] = MOST_STEPS_OF_SEARCH,
+    ] = float(MOST_STEPS_OF_SEARCH),
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -282,7 +282,7 @@ def _tell_cost(pendulum: Pendulum, max_period: float, theta1: float | None, most
 
 
 # Seconds between two lines about a search whose standard error is no terminal.
-_BETWEEN_LINES = 10.0
+_BETWEEN_LINES = 15.0
 
 
 @contextlib.contextmanager
@@ -296,7 +296,7 @@ def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
             show(done, planned)
             if not _on_terminal() and time.perf_counter() - last > _BETWEEN_LINES:
                 last = time.perf_counter()
-                print(f"dpend: {done:.0f} of about {planned:.0f} {unit}, {last - started:.0f} s", file=sys.stderr)
+                print(f"dpend: {done:.3g} of about {planned:.3g} {unit}, {last - started:.0f} s", file=sys.stderr)
 
         yield tell
 
