@@ -1125,7 +1125,7 @@ def _run(arguments: list[str]) -> int:
         return status
     except (KeyboardInterrupt, typer.Abort):
         return 130
-    except BrokenPipeError:
+    except (BrokenPipeError, SystemExit):  # the latter is typer's answer to a closed pipe, and to nothing else here
         return 141
     except typer.Exit as stop:
         return stop.exit_code
