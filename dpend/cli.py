@@ -6,6 +6,7 @@ error. 130: interrupted. 141: nobody reads standard output any more.
 
 import contextlib
 import csv
+import errno
 import io
 import math
 import os
@@ -1191,22 +1192,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
     os.environ.pop("MPLBACKEND", None)  # for windows, of which the program opens none
+    warnings.filterwarnings("ignore", message=".*persistent compilation cache")  # a cache only saves time
     catch_interrupts()
     status = _run(sys.argv[1:] if arguments is None else list(arguments))
     leave_quietly()
-    if not _output_is_open():  # Python would try once more when it ends, and say so with a traceback
+    if _flush() is not None:  # Python would try once more when it ends, and say so with a traceback
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(status)
 
 
-def _output_is_open() -> bool:
-    """Whether what was printed could be written."""
+def _flush() -> OSError | None:
+    """Writes what was printed; why it could not be, if so."""
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
-    except OSError:
-        return False
-    return True
+    except OSError as error:
+        return error
+    return None
 
 
 def _run(arguments: list[str]) -> int:
@@ -1217,12 +1219,15 @@ def _run(arguments: list[str]) -> int:
         _keep_compiled_code()
         with np.errstate(all="ignore"):  # what overflows is told by the status or by the line that refuses it
             status = int(app(arguments or ["--help"], standalone_mode=False) or 0)
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        lost = _flush()
+        if isinstance(lost, BrokenPipeError):
+            return 141
+        if lost is not None:
+            return _tell(lost)
         return status
     except (KeyboardInterrupt, typer.Abort):
         return 130
-    except BrokenPipeError:
+    except (BrokenPipeError, SystemExit):  # the latter is typer's answer to a closed pipe, and to nothing else here
         return 141
     except typer.Exit as stop:
         return stop.exit_code
@@ -1240,8 +1245,8 @@ def _tell(error: Exception) -> int:
     if isinstance(error, MemoryError):
         _complain(f"there is not enough memory ({error}): give fewer steps, cells or points")
         return 1
-    if isinstance(error, OSError) and not _output_is_open():
-        _complain(f"standard output cannot be written ({error.strerror or error}): make room, or give another place")
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
+        _complain(f"{error.filename or 'standard output'} cannot be written ({error.strerror}): make room for it")
         return 1
     if not isinstance(error, (ValueError, OSError, RuntimeError)):
         raise error

@@ -384,8 +384,9 @@ def fit_parameters(
     Raises:
         ValueError: a free set with the overall length or mass in it, an unknown or repeated name; times that do not
             increase or are too far apart; arrays of other lengths, infinite, with fewer than 7 angles of a rod, or with
-            fewer than there are unknowns; angles that look like degrees; nothing measured at the first time; noise or
-            initial values that are no such numbers; g zero and free.
+            fewer than there are unknowns; angles that look like degrees; nothing measured at the first time; initial
+            values that are no such numbers; noise below 1e-15 or above pi rad; a pendulum with l2/l1 or m2/m1 beyond
+            1e9 or below 1e-9; g zero and free.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()

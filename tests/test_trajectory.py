@@ -383,3 +383,27 @@ def test_reverse_mode_under_jit(paper):
         return dpend.flow(paper, dpend.released(theta1, 2.0), 0.5, Scheme("rk4", 1e-2)).theta1
 
     assert abs(jax.jit(jax.grad(angle))(1.0) - jax.jacfwd(angle)(1.0)) < 1e-12
+
+
+def test_a_reference_that_could_not_end_is_refused_or_says_so(paper):
+    with pytest.raises(
+        ValueError, match="tolerance must be at least 1e-13, which rounding leaves room for, got 1e-300"
+    ):
+        dpend.reference(paper, RELEASE, [1.0], tolerance=1e-300)
+    with pytest.raises(ValueError, match="most_steps must be an integer of at least 1, got 0"):
+        dpend.reference(paper, RELEASE, [1.0], most_steps=0)
+
+
+@pytest.mark.slow
+def test_a_reference_stops_after_the_steps_that_are_allowed(paper):
+    motion = dpend.reference(paper, RELEASE, [5.0], most_steps=100, error=False)
+    assert (int(motion.status), int(motion.steps)) == (Status.MAX_ITERATIONS, 100)
+
+
+def test_steps_are_counted_before_they_are_taken(paper):
+    with pytest.raises(ValueError, match="step must make at most 9 steps, got 0.1 s, which makes 10: .*most_steps"):
+        dpend.simulate(paper, RELEASE, 1.0, step=0.1, most_steps=9)
+    with pytest.raises(ValueError, match="step must make at most 1e.12 steps, got 5e-324 s, which makes inf"):
+        dpend.flow(paper, RELEASE, 1.0, dpend.Scheme("rk8", 5e-324))
+    with pytest.raises(ValueError, match="method must be one of rk4, .* got ''"):
+        dpend.simulate(paper, RELEASE, 1.0, step=0.1, method="")
