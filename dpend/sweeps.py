@@ -126,6 +126,9 @@ def sweep(
     function("quantity", quantity, "(pendulum, state, scheme)", example)
     keyed = _Keyed.of(quantity)
     grid = _Grid.checked(pendulum, axes, {} if at is None else at)
+    most = known_number("most_steps", most_steps, positive=True)
+    if most > _COUNTABLE:
+        raise ValueError(f"most_steps must be at most {_COUNTABLE:g}, got {most:g}: give fewer")
     scheme = _scheme(grid, tolerance, method, step)
     if not (error is None or (isinstance(error, str) and error == "half-step")):
         raise ValueError(f'error must be None or "half-step", got {shown(error)}: give one of them')
@@ -136,9 +139,6 @@ def sweep(
         function("progress", progress, "(cells done, cells in all, steps)", "print")
     if announce is not None:
         function("announce", announce, "a Cost", "print")
-    most = known_number("most_steps", most_steps, positive=True)
-    if most > _COUNTABLE:
-        raise ValueError(f"most_steps must be at most {_COUNTABLE:g}, got {most:g}: give fewer")
     work = _Work(_Task(keyed, grid, scheme, error is not None, mirror), most)
     work.tell, work.announce = progress, announce
     if place is None:
