@@ -3,6 +3,10 @@
 Angles in radians, SI units. The public names are those below; each module's page says what it computes and how.
 """
 
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 from dpend import _runtime as _runtime  # sets JAX up: before anything else
 from dpend import chaos as chaos
 from dpend.atlas import Atlas as Atlas
@@ -55,4 +59,15 @@ from dpend.trajectory import message as message
 from dpend.trajectory import reference as reference
 from dpend.trajectory import simulate as simulate
 
+if TYPE_CHECKING:
+    from dpend import animate as animate
+    from dpend import plots as plots
+
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> ModuleType:
+    """The pages that draw, imported when they are first asked for."""
+    if name in ("plots", "animate"):
+        return importlib.import_module(f"dpend.{name}")
+    raise AttributeError(f"module 'dpend' has no attribute {name!r}")

@@ -6,30 +6,48 @@ its rows; those of families over the whole square come from `survey`.
 
 import csv
 import io
-import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.families import known_pendulum
+from dpend.catalogue import COLUMNS, UNITS, file_name, file_values, pendulum_record, read_catalogue
+from dpend.checks import file_path, function, known_number, known_real, one_of, several, shown
 from dpend.files import check_place, json_text, replacing
-from dpend.orbits import SYMMETRIES, PeriodicOrbit, find_orbit
+from dpend.orbits import SYMMETRIES, PeriodicOrbit, find_orbit, swinging_pendulum
 from dpend.pendulum import Pendulum, released
-from dpend.scan import Scan, Zero, longest, scanned
+from dpend.scan import (
+    MOTIONS_PER_WAVE,
+    RETURNS_PER_WAVE,
+    Budget,
+    Outlook,
+    Scan,
+    Zero,
+    foresee,
+    longest,
+    scanned,
+)
 from dpend.shooting import natural
-from dpend.trajectory import Status, known_number
+from dpend.trajectory import Status
+from dpend.trig import LARGEST_ANGLE
 
 # Intervals of theta2 that a scan begins with, and how often they are doubled at most.
 _INTERVALS, _MOST_REFINEMENTS = 128, 6
+# What a search may take if nothing else is said [time steps]: twenty minutes. Solving a return by
+# `find_orbit` takes about as long as so many steps.
+MOST_STEPS, STEPS_PER_ORBIT, SECONDS_PER_STEP = 300_000_000, 10_000, 4e-6
+# Larger numbers are not counted.
+COUNTABLE = 10**18
+# Powers of ten. A lower bob of 1e-200 of the upper one's mass takes products of momenta below what float64 holds;
+# with a lower rod of 1e-28 of the upper one its own momentum is lost in what the upper one adds to it.
+_FARTHEST_MASSES, _FARTHEST_LENGTHS, _FARTHEST_UNIT = 30, 12, 90
 # A scan looks this share further than asked, so that an orbit of just the longest period lies inside.
-_BEYOND = 1e-3
+BEYOND = 1e-3
 
 
 @dataclass(frozen=True)
@@ -48,6 +66,8 @@ class Coverage:
             all returns found, those of orbits run through several times included: unequal if one is missing. Of several
             slices their sums.
         slices: release angles that were scanned.
+        exhausted: whether the search was broken off because it would have taken more than was allowed: what was found
+            is right, and more is likely to be missing.
     """
 
     theta2_points: int
@@ -57,6 +77,7 @@ class Coverage:
     winding: int
     degree: int
     slices: int = 1
+    exhausted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +113,9 @@ class Atlas:
     def where(
         self,
         *,
-        period: Sequence[Any] | None = None,
-        energy: Sequence[Any] | None = None,
-        kappa: Sequence[Any] | None = None,
+        period: Sequence[Any] | Any | None = None,
+        energy: Sequence[Any] | Any | None = None,
+        kappa: Sequence[Any] | Any | None = None,
         symmetry: Any = None,
         family: Any = None,
     ) -> "Atlas":
@@ -108,27 +129,24 @@ class Atlas:
             if bounds is not None:
                 low, high = _range(name, bounds)
                 keep &= (self.table[name] >= low) & (self.table[name] <= high)
-        names = {one["family"] for one in self.families}
-        for name, wanted, known in (("symmetry", symmetry, set(SYMMETRIES)), ("family", family, names)):
+        names = [one["family"] for one in self.families]
+        for name, wanted, known in (("symmetry", symmetry, list(SYMMETRIES)), ("family", family, names)):
             if wanted is not None:
-                chosen = list(wanted) if isinstance(wanted, (list, tuple, set)) else [wanted]
-                for one in chosen:
-                    if one not in known:
-                        raise ValueError(f"{name} must be one of {', '.join(sorted(known)) or 'none'}, got {one!r}")
+                given = list(wanted) if isinstance(wanted, (list, tuple, set)) else [wanted]
+                chosen = [one_of(name, one, sorted(known)) for one in given]
                 keep &= np.isin(self.table[name], chosen)
         return replace(self, table={key: column[keep] for key, column in self.table.items()})
 
     def record(self) -> dict[str, Any]:
         """All of it as plain numbers and text, angles in degrees: what `save` writes and `--json` prints."""
-        columns = {_file_name(key): _out(key, column).tolist() for key, column in self.table.items()}
+        columns = {file_name(key): file_values(key, column) for key, column in self.table.items()}
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         for row in rows:
-            row["status"] = Status(row["status"]).name.lower()
             row["dual"] = {key: row.pop(f"dual_{key}") for key in ("theta1_deg", "theta2_deg")}
             row["turns"] = [row.pop("turns1"), row.pop("turns2")]
         return {**self._about(), "orbits": rows}
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str] | Any) -> None:
         """Writes F.json, or F.csv whose first line is a comment with all but the table, to be read by `load_atlas`.
 
         Angles in degrees, which may cost their last bit, everything else as it is. How many digits of theta2 and the
@@ -137,7 +155,7 @@ class Atlas:
         Raises:
             ValueError: another ending; no directory to write in.
         """
-        path = Path(path)
+        path = file_path("path", path)
         check_place("path", path, (".csv", ".json"))
         with replacing(path) as draft:
             draft.write_text(self._json() if path.suffix == ".json" else self._csv())
@@ -149,9 +167,10 @@ class Atlas:
             "dpend_version": dpend.__version__,
             "pendulum": pendulum_record(self.pendulum),
             "max_period_s": self.max_period,
-            "units": dict(_UNITS),
+            "units": dict(UNITS),
             "coverage": asdict(self.coverage),
             "families": list(self.families),
+            "rows": len(self),
         }
 
     def _json(self) -> str:
@@ -164,99 +183,37 @@ class Atlas:
         text = io.StringIO()
         text.write("# " + json_text(self._about(), indent=None) + "\n")
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([_file_name(key) for key in self.table])
-        columns = {key: _out(key, column).tolist() for key, column in self.table.items()}
-        columns["status"] = [Status(status).name.lower() for status in columns["status"]]
-        writer.writerows(zip(*columns.values(), strict=True))
+        writer.writerow([file_name(key) for key in self.table])
+        writer.writerows(zip(*(file_values(key, column) for key, column in self.table.items()), strict=True))
         return text.getvalue()
 
 
-def load_atlas(path: str | os.PathLike[str]) -> Atlas:
-    """The atlas that `Atlas.save` wrote to F.json or F.csv.
+def load_atlas(path: str | os.PathLike[str] | Any) -> Atlas:
+    """The atlas that `Atlas.save` wrote to F.json or F.csv, every row held to what is true of orbits.
+
+    Energies, kappa and its logarithm, both rests of a centred orbit and neighbours on a family have to agree, so that a
+    file that was damaged on its way is refused; a row whose status is another than `converged` need not agree.
 
     Raises:
-        ValueError: no such file, or one that holds no atlas.
+        ValueError: no such file, or one that holds no atlas: with the row, the column and what is wrong.
     """
-    path = Path(path)
+    path = file_path("path", path)
     if path.suffix not in (".csv", ".json"):
         raise ValueError(f"path must end in .csv or .json, got {path}: Atlas.save writes no others")
     try:
-        text = path.read_text()
-        if path.suffix == ".csv":
-            first, _, rest = text.partition("\n")
-            about, rows = json.loads(first.removeprefix("#")), list(csv.DictReader(io.StringIO(rest)))
-        else:
-            about = json.loads(text)
-            rows = about.pop("orbits")
-            for row in rows:
-                row |= {f"dual_{key}": value for key, value in row.pop("dual").items()}
-                row |= dict(zip(("turns1", "turns2"), row.pop("turns"), strict=True))
-        table = {key: _in(key, [row[_file_name(key)] for row in rows]) for key in _COLUMNS}
-        families, coverage = tuple(about["families"]), Coverage(**about["coverage"])
-        return Atlas(Pendulum(*about["pendulum"].values()), about["max_period_s"], table, families, coverage)
+        pendulum, max_period, table, families, coverage = read_catalogue(path)
     except OSError as error:
-        raise ValueError(f"path must be a file that can be read, got {path} ({error.strerror})") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"path must be a file that Atlas.save wrote, got {path} ({error})") from None
+        raise ValueError(
+            f"path must be a file that can be read, got {path} ({error.strerror}): give another file"
+        ) from None
+    except ValueError as error:
+        raise ValueError(
+            f"path must be a file that Atlas.save wrote, got {path} ({error}): give another file"
+        ) from None
+    return Atlas(pendulum, max_period, table, families, Coverage(**coverage))
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
-
-_UNITS = {
-    "theta1": "deg",
-    "theta2": "deg",
-    "dual_theta1": "deg",
-    "dual_theta2": "deg",
-    "theta2_error": "deg",
-    "period": "s",
-    "period_error": "s",
-    "energy": "J",
-}
-# Columns and their types; those without a unit here are as in `PeriodicOrbit` and `Family`.
-_COLUMNS: dict[str, type] = {
-    "family": str,
-    "arclength": float,
-    "theta1": float,
-    "theta2": float,
-    "period": float,
-    "energy": float,
-    "kappa": float,
-    "log_abs_kappa": float,
-    "symmetry": str,
-    "dual_theta1": float,
-    "dual_theta2": float,
-    "turns1": int,
-    "turns2": int,
-    "residual": float,
-    "theta2_error": float,
-    "period_error": float,
-    "iterations": int,
-    "status": int,
-}
-
-
-def pendulum_record(pendulum: Pendulum) -> dict[str, float]:
-    """A pendulum as it stands in files."""
-    names = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
-    return {key: float(getattr(pendulum, name)) for name, key in names.items()}
-
-
-def _file_name(column: str) -> str:
-    return f"{column}_{_UNITS[column]}" if column in _UNITS else column
-
-
-def _out(column: str, values: np.ndarray) -> np.ndarray:
-    return np.degrees(values) if _UNITS.get(column) == "deg" else values
-
-
-def _in(column: str, values: list[Any]) -> np.ndarray:
-    if column == "status":
-        return np.array([int(Status[value.upper()]) for value in values], int)
-    kind = _COLUMNS[column]
-    array: np.ndarray = np.array(
-        [math.nan if kind is float and value is None else kind(value) for value in values], kind
-    )
-    return np.radians(array) if _UNITS.get(column) == "deg" else array
 
 
 def table_of(orbits: PeriodicOrbit, family: str, arclength: Any) -> dict[str, np.ndarray]:
@@ -275,14 +232,14 @@ def table_of(orbits: PeriodicOrbit, family: str, arclength: Any) -> dict[str, np
     columns |= {"iterations": orbits.iterations, "status": orbits.status, "arclength": arclength}
     count = len(np.asarray(orbits.period))
     columns |= {"family": np.full(count, family), "symmetry": np.full(count, orbits.symmetry)}
-    return {key: np.asarray(columns[key], kind) for key, kind in _COLUMNS.items()}
+    return {key: np.asarray(columns[key], kind) for key, kind in COLUMNS.items()}
 
 
 def stacked(tables: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """One table below the other."""
     return {
         key: np.concatenate([table[key] for table in tables]) if tables else np.zeros(0, kind)
-        for key, kind in _COLUMNS.items()
+        for key, kind in COLUMNS.items()
     }
 
 
@@ -305,19 +262,25 @@ def _orbit(pendulum: Pendulum, row: dict[str, Any]) -> PeriodicOrbit:
 
 
 def _range(name: str, bounds: Any) -> tuple[float, float]:
-    try:
-        low, high = (float(bound) for bound in bounds)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a pair (low, high), got {bounds!r}") from None
+    low, high = (known_real(name, bound) for bound in several(name, bounds, "a pair (low, high)", 2))
     if not low <= high:
-        raise ValueError(f"{name} must be a pair (low, high) with low at most high, got {bounds!r}")
+        raise ValueError(
+            f"{name} must be a pair (low, high) with low at most high, got {shown(bounds)}: give them in order"
+        )
     return low, high
 
 
 # --- one release angle ------------------------------------------------------------------------------------------------
 
 
-def find_brake_orbits(pendulum: Pendulum, *, theta1: Any, max_period: Any) -> Atlas:
+def find_brake_orbits(
+    pendulum: Pendulum | Any,
+    *,
+    theta1: Any,
+    max_period: Any,
+    most_steps: Any = MOST_STEPS,
+    progress: Callable[[int, int], None] | Any | None = None,
+) -> Atlas:
     """Every orbit released from rest at `theta1` with a period of at most `max_period`: all its partners theta2.
 
     The returns to rest are all zeros of (p1, p2) in (theta2, t), found cell by cell (see `scan`). The scan is repeated
@@ -330,25 +293,36 @@ def find_brake_orbits(pendulum: Pendulum, *, theta1: Any, max_period: Any) -> At
         pendulum: its fields are numbers; g positive.
         theta1: release angle of the upper rod [rad].
         max_period: [s]. The number of orbits, and the time it takes, grows exponentially with it.
+        most_steps: time steps of all motions, 2 to 8 microseconds each on one core. A search that will take more is
+            refused before it begins; one that takes more after all ends there, and its coverage says `exhausted`.
+        progress: called with the time steps so far, and with those that are expected in all.
     Returns:
         Atlas, in order of the period; theta2 in (-pi, pi].
     Raises:
-        ValueError: theta1 not finite; max_period not positive, or so long that the fast normal mode would swing 32
-            times; g not positive; a traced argument.
+        ValueError: theta1 not finite, or beyond 1.3e7 rad; max_period not positive, or so long that the fast normal
+            mode would swing 32 times, or that most_steps are not enough; g not positive; a traced argument; lengths,
+            masses or g whose products leave the range of float64.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    fixed = known_pendulum(pendulum)
-    theta1 = known_number("theta1", theta1, unit="rad")
+    fixed = swinging_pendulum(pendulum)
+    theta1, most_steps = _known_angle(theta1), known_number("most_steps", most_steps, positive=True)
+    if progress is not None:
+        function("progress", progress, "(steps taken, steps expected)", "print")
     max_period = known_period(fixed, max_period)
+    expected = expected_steps(fixed, max_period, theta1)
+    budget = known_budget(most_steps, expected, max_period)
+    if progress is not None:
+        progress(0, expected)
+        budget.tell = lambda spent: progress(spent, max(spent, expected))
     counts: list[int] = []
     for refinement in range(_MOST_REFINEMENTS + 1):
-        result = returns(fixed, theta1, max_period, _INTERVALS << refinement)
+        result = returns(fixed, theta1, max_period, _INTERVALS << refinement, budget)
         counts.append(len(result.zeros))
         unsettled = max(counts[-3:]) - min(counts[-3:])
-        if (len(counts) > 2 and not unsettled) or result.exhausted:
+        if (len(counts) > 2 and not unsettled) or budget.exhausted:
             break
-    found, lost = _solved(fixed, theta1, max_period, result)
+    found, lost = _solved(fixed, theta1, max_period, result, budget)
     coverage = Coverage(
         theta2_points=result.motions,
         time_points=result.rows,
@@ -356,42 +330,109 @@ def find_brake_orbits(pendulum: Pendulum, *, theta1: Any, max_period: Any) -> At
         suspicious_cells=len(result.open_cells) + lost + abs(result.winding - result.degree) + unsettled,
         winding=result.winding,
         degree=result.degree,
+        exhausted=budget.exhausted,
     )
     return Atlas(fixed, max_period, stacked([_row(orbit) for orbit in found]), (), coverage)
 
 
+def _known_angle(theta1: Any) -> float:
+    value = known_number("theta1", theta1, unit="rad")
+    if abs(value) > LARGEST_ANGLE:
+        raise ValueError(
+            f"theta1 must be at most {LARGEST_ANGLE:.2g} rad, beyond which its sine has no digits left, got {value:g}: "
+            "take off full turns"
+        )
+    return value
+
+
 def known_period(pendulum: Pendulum, max_period: Any) -> float:
-    """`max_period`, refused where no scan reaches."""
+    """`max_period`, refused where no scan reaches, and pendulums that float64 cannot hold."""
     value = known_number("max_period", max_period, positive=True, unit="s")
+    _check_scales(pendulum)
     most = 2 * longest(jax.tree.map(float, natural(pendulum))) * math.sqrt(pendulum.l1 / pendulum.g)
     if value > most:
         raise ValueError(f"max_period must be at most {most:.4g} s for this pendulum, got {value:g}: ask for less")
     return value
 
 
-def returns(pendulum: Pendulum, theta1: float, max_period: float, intervals: int) -> Scan:
-    """All returns to rest within half of `max_period`, times in seconds."""
+def _check_scales(pendulum: Pendulum) -> None:
+    """Refuses a pendulum whose numbers are so far apart that their products leave the range of float64."""
+    l1, l2, m1, m2, g = (math.log10(float(getattr(pendulum, name))) for name in ("l1", "l2", "m1", "m2", "g"))
+    for names, ratio, most in (("l1 and l2", l2 - l1, _FARTHEST_LENGTHS), ("m1 and m2", m2 - m1, _FARTHEST_MASSES)):
+        if abs(ratio) > most:
+            values = " and ".join(f"{float(getattr(pendulum, name)):g}" for name in names.split(" and "))
+            raise ValueError(
+                f"{names} must be within a factor of 1e{most} of each other, beyond which float64 loses the momenta, "
+                f"got {values}: give others"
+            )
+    units = {"sqrt(l1/g)": 0.5 * (l1 - g), "m1 g l1": m1 + g + l1, "m1 l1 sqrt(g l1)": m1 + 1.5 * l1 + 0.5 * g}
+    for name, size in units.items():
+        if abs(size) > _FARTHEST_UNIT:
+            raise ValueError(
+                f"{name} must be within 1e-{_FARTHEST_UNIT} and 1e{_FARTHEST_UNIT} in SI units, beyond which products "
+                f"leave the range of float64, got 1e{size:.0f}: use other units"
+            )
+
+
+def expected_steps(pendulum: Pendulum, max_period: float, theta1: float) -> int:
+    """The time steps that `find_brake_orbits` will take, roughly: three scans, and the returns solved."""
+    seen = foresee_returns(pendulum, theta1, max_period)
+    motions = 2 * (_INTERVALS << 3) + 3 * MOTIONS_PER_WAVE * seen.waves
+    return int(min(motions * seen.rows + RETURNS_PER_WAVE * seen.waves * STEPS_PER_ORBIT, COUNTABLE))
+
+
+def foresee_returns(pendulum: Pendulum, theta1: float, max_period: float) -> Outlook:
+    """What `returns` has before it."""
+    scaled, half, _ = _in_natural_units(pendulum, max_period)
+    return foresee(scaled, math.remainder(theta1, 2 * math.pi), half)
+
+
+def known_budget(most_steps: float, expected: int, max_period: float) -> Budget:
+    """`most_steps`, refused if the search is expected to take more."""
+    if most_steps < expected:
+        raise ValueError(
+            f"max_period must be so short that most_steps, {most_steps:g}, are enough, got {max_period:g} s, which "
+            f"takes about {expected:.1g}, {expected * SECONDS_PER_STEP:.1g} s of time: ask for less, or raise "
+            "most_steps"
+        )
+    return Budget(int(min(most_steps, COUNTABLE)))
+
+
+def _in_natural_units(pendulum: Pendulum, max_period: float) -> tuple[Pendulum, float, float]:
+    """The pendulum, the longest half period with a margin, and the second."""
     second = math.sqrt(pendulum.l1 / pendulum.g)
-    scaled = jax.tree.map(float, natural(pendulum))
-    half = 0.5 * max_period / second * (1 + _BEYOND)
-    result = scanned(scaled, math.remainder(theta1, 2 * math.pi), half, intervals)
+    return jax.tree.map(float, natural(pendulum)), 0.5 * max_period / second * (1 + BEYOND), second
+
+
+def returns(pendulum: Pendulum, theta1: float, max_period: float, intervals: int, budget: Budget) -> Scan:
+    """All returns to rest within half of `max_period`, times in seconds."""
+    scaled, half, second = _in_natural_units(pendulum, max_period)
+    result = scanned(scaled, math.remainder(theta1, 2 * math.pi), half, intervals, budget)
     zeros = tuple(zero._replace(time=zero.time * second, row=zero.row * second) for zero in result.zeros)
     return replace(result, zeros=zeros)
 
 
-def _solved(pendulum: Pendulum, theta1: float, max_period: float, result: Scan) -> tuple[list[PeriodicOrbit], int]:
+def _solved(
+    pendulum: Pendulum, theta1: float, max_period: float, result: Scan, budget: Budget
+) -> tuple[list[PeriodicOrbit], int]:
     """The orbits to which the returns belong, in order of the period, and the number that Newton's method lost."""
     found: list[PeriodicOrbit] = []
+    known = np.zeros((0, 2))
     lost = 0
     own_mirror = abs(math.sin(theta1)) < 1e-12
     for zero in sorted(result.zeros, key=lambda zero: zero.time):
-        if (own_mirror and zero.theta2 < 0) or any(is_return(orbit, zero) for orbit in found):
+        if (own_mirror and zero.theta2 < 0) or np.any(are_returns(known, zero)):
+            continue
+        if budget.exhausted:
+            lost += 1
             continue
         orbit = find_orbit(pendulum, theta1, guess=(zero.theta2, 2 * zero.time))
+        budget.spend(STEPS_PER_ORBIT)
         if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
             lost += 1
         elif float(orbit.period) <= max_period * (1 + 1e-12):
             found.append(orbit)
+            known = np.vstack([known, _place_of(orbit)])
     return sorted(found, key=lambda orbit: float(orbit.period)), lost
 
 
@@ -401,10 +442,21 @@ _LOCATED = 0.2
 
 def is_return(orbit: PeriodicOrbit, zero: Zero) -> bool:
     """Whether a return to rest is that of an orbit, maybe run through several times."""
-    apart = abs(math.remainder(float(orbit.theta2) - zero.theta2, 2 * math.pi))
-    half = 0.5 * float(orbit.period)
-    late = abs(zero.time - half * max(1, round(zero.time / half)))
-    return apart < max(_LOCATED * zero.width, 1e-12) and late < _LOCATED * zero.row
+    return bool(are_returns(_place_of(orbit), zero)[0])
+
+
+def _place_of(orbit: PeriodicOrbit) -> np.ndarray:
+    return np.array([[float(orbit.theta2), 0.5 * float(orbit.period)]])
+
+
+def are_returns(places: np.ndarray, zero: Zero) -> np.ndarray:
+    """The same of many orbits' theta2 and half periods, shape (n, 2)."""
+    apart = np.abs(places[:, 0] - zero.theta2)
+    apart = np.abs(apart - 2 * np.pi * np.round(apart / (2 * np.pi)))
+    half = places[:, 1]
+    late = np.abs(zero.time - half * np.maximum(1, np.round(zero.time / half)))
+    near: np.ndarray = (apart < max(_LOCATED * zero.width, 1e-12)) & (late < _LOCATED * zero.row)
+    return near
 
 
 def _row(orbit: PeriodicOrbit) -> dict[str, np.ndarray]:

@@ -10,17 +10,28 @@ Exponents in the limit of long times do not depend on the norm; finite-time ones
 """
 
 import math
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from dpend.checks import integer, known_number, number
 from dpend.events import first_crossing
-from dpend.pendulum import Pendulum, Scalar, State, energy_scale, fast_frequency, hamiltonian, number
-from dpend.steppers import Scheme
+from dpend.pendulum import (
+    Pendulum,
+    Scalar,
+    State,
+    check_motion,
+    check_pendulum,
+    energy_scale,
+    fast_frequency,
+    hamiltonian,
+)
+from dpend.steppers import Scheme, check_scheme
 from dpend.trajectory import fold
 
 # A tangent is scaled back by this once an angle of it exceeds the inverse: seldom, and exactly, being a power of two.
@@ -46,8 +57,9 @@ class Norm(NamedTuple):
         )
 
 
-def norm(pendulum: Pendulum) -> Norm:
+def norm(pendulum: Pendulum | Any) -> Norm:
     """The norm in which this page measures tangents of `pendulum`."""
+    check_pendulum(pendulum)
     frequency = fast_frequency(pendulum)
     rate = jnp.where(frequency > 0, frequency, 1.0)
     unit1 = (pendulum.m1 + pendulum.m2) * pendulum.l1 * pendulum.l1 * rate
@@ -81,6 +93,23 @@ def _log(norm: Norm, tangent: State, count: _Count) -> Scalar:
     return 0.5 * jnp.log(norm.square(tangent)) - math.log(_SCALE_BACK) * count.turns
 
 
+def _at_the_door(compiled: Callable[..., dict[str, Scalar]]) -> Callable[..., dict[str, Scalar]]:
+    """A compiled quantity behind the checks of its arguments, which `jit` would refuse in words of its own."""
+
+    @wraps(compiled)
+    def quantity(pendulum: Any, state: Any, scheme: Any, **settings: Any) -> dict[str, Scalar]:
+        check_motion(pendulum, state)
+        check_scheme(scheme)
+        if "duration" in settings:
+            settings["duration"] = known_number("duration", settings["duration"], unit="s")
+        if "windows" in settings:
+            settings["windows"] = integer("windows", settings["windows"], least=4)
+        return compiled(pendulum, state, scheme, **settings)
+
+    return quantity
+
+
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def lyapunov(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """The finite-time Lyapunov exponent ln(|d(T)|/|d(0)|)/T of a generic tangent [1/s].
@@ -103,6 +132,7 @@ def lyapunov(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     return {"lyapunov": _log(size, tangent, count) / duration, "steps": count.steps.astype(int)}
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration", "windows"))
 def maximal_lyapunov(
     pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float, windows: int = 20
@@ -124,8 +154,8 @@ def maximal_lyapunov(
         ValueError: windows odd or too few; as `flow`.
     """
     duration = float(number("duration", duration, positive=True, unit="s"))
-    if windows < 4 or windows % 2:
-        raise ValueError(f"windows must be an even number of at least 4, got {windows}")
+    if windows % 2:
+        raise ValueError(f"windows must be an even number of at least 4, got {windows}: give {windows + 1}")
     size = norm(pendulum)
 
     def window(carry: tuple[State, State, Scalar], _: None) -> tuple[tuple[State, State, Scalar], Scalar]:
@@ -150,6 +180,7 @@ def _followed(both, time, dt, state, tangent):  # type: ignore[no-untyped-def]
     return (state, count), tangent
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def spectrum(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """All four Lyapunov exponents over a finite time, largest first [1/s].
@@ -193,6 +224,7 @@ def spectrum(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     return {f"exponent{i + 1}": logs[i] / duration for i in range(4)} | {"steps": steps.astype(int)}
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def megno(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """The time-averaged MEGNO, mean exponential growth of nearby orbits.
@@ -234,13 +266,12 @@ def _upright(pendulum: Pendulum, state: State) -> tuple[Scalar, Scalar]:
 
     def wave(theta: Scalar) -> Scalar:
         turn = theta / (4 * math.pi)
-        value = 0.25 - jnp.abs(turn - jnp.round(turn))
-        # A release at pi in floating point is a release at pi.
-        return jnp.where(jnp.abs(value) < 1e-15, 0.0, value)
+        return 0.25 - jnp.abs(turn - jnp.round(turn))
 
     return wave(state.theta1), wave(state.theta2)
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def flip(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """When a bob first goes over the top: the first t > 0 at which cos(theta1/2) or cos(theta2/2) changes sign.
@@ -264,6 +295,7 @@ def flip(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -
     return {"flip_time": time, "bob": crossing.which + 1, "steps": crossing.steps.astype(int)}
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def drift(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """The largest |H - H(0)| after any step, in units of `energy_scale`: how well the method keeps the energy.

@@ -1,32 +1,74 @@
 """The command line: the only module that prints. Angles are in degrees here, and nowhere else but in CSV and JSON.
 
 Exit status 0: done. 1: ran, but some solve failed, or the environment is wrong. 2: bad input, one line on standard
-error. 130: interrupted.
+error. 130: interrupted. 141: nobody reads standard output any more.
 """
 
 import contextlib
 import csv
+import errno
+import io
 import math
 import os
+import re
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import numpy as np
 import typer
 
 import dpend
-from dpend.atlas import pendulum_record
-from dpend.files import check_place, json_text, replacing
-from dpend.orbits import BRANCHES, PeriodicOrbit
-from dpend.pendulum import Pendulum, State, number
+from dpend import survey
+from dpend._runtime import catch_interrupts, leave_quietly
+from dpend.atlas import MOST_STEPS as MOST_STEPS_OF_SEARCH
+from dpend.atlas import SECONDS_PER_STEP, expected_steps, known_period
+from dpend.catalogue import pendulum_record
+from dpend.checks import number
+from dpend.files import check_place, json_text, parse_decimal, replacing
+from dpend.orbits import BRANCHES, PeriodicOrbit, swinging_pendulum
+from dpend.pendulum import Pendulum, State
 from dpend.steppers import METHODS
-from dpend.sweeps import check_store
-from dpend.trajectory import Status, Trajectory
+from dpend.stores import StoreWarning, check_store
+from dpend.sweeps import Cost
+from dpend.trajectory import MOST_STEPS, Status, Trajectory
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+class _Command(typer.core.TyperCommand):
+    """A command that refuses what no option can mean: one given twice, an empty text, a number that is not finite."""
+
+    # Any: each version of typer has its own class of contexts.
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        for option in self.params:
+            name, times = max(option.opts, key=len), sum(option is one for one in order)
+            if times > 1 and not option.multiple and option.nargs == 1:
+                raise ValueError(f"{name} must be given once at most, got it {times} times: leave out all but one")
+            if "" in _several(given.get(option.name or "")):
+                raise ValueError(f"{name} must not be empty, got '': give a value, or leave {name} out")
+        rest = super().parse_args(ctx, args)
+        for option in self.params:
+            unit = re.search(r"( \[[^]]+\]|)[^]]*$", getattr(option, "help", None) or "")
+            for one in _several(ctx.params.get(option.name or "")):
+                if isinstance(one, float) and not math.isfinite(one):
+                    raise ValueError(
+                        f"{option.name} must be a finite number{unit[1] if unit else ''}, got {one}: "
+                        f"give another {option.name}"
+                    )
+        return rest
+
+
+def _several(value: object) -> Sequence[object]:
+    return value if isinstance(value, (list, tuple)) else (value,)
+
 
 app = typer.Typer(
     name="dpend",
@@ -37,18 +79,29 @@ app = typer.Typer(
 )
 
 
-def _number(text: str | float) -> float:  # defaults come as what they are
-    try:
+def _number(text: str | float | int) -> float:  # defaults come as what they are
+    if not isinstance(text, str):
         return float(text)
+    if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return float(text)  # the command refuses it by the name of its option
+    try:
+        return parse_decimal(text)
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is not a number: give one like 40 or 1e-3") from None
+        raise typer.BadParameter(f"{text!r:.60} is not a number: give one like 40 or 1e-3") from None
+
+
+# What a count fits in, here and in the compiled programs.
+_LARGEST_INTEGER = 2**63 - 1
 
 
 def _integer(text: str | int) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not an integer: give one like 1") from None
+    if not isinstance(text, str):
+        return text
+    if not re.fullmatch(r"[+-]?\d+", text, re.ASCII):
+        raise typer.BadParameter(f"{text!r:.60} is not an integer: give one like 1")
+    if len(text) > 20 or abs(int(text)) > _LARGEST_INTEGER:
+        raise typer.BadParameter(f"{text!r:.60} is beyond {_LARGEST_INTEGER}: give a smaller one")
+    return int(text)
 
 
 def _numeric(*names: str, help: str) -> Any:
@@ -69,7 +122,7 @@ def _commands() -> None:
     """Keeps `dpend orbit` a subcommand."""
 
 
-@app.command()
+@app.command(cls=_Command)
 def orbit(
     theta1: _Theta1,
     branch: Annotated[
@@ -87,8 +140,11 @@ def orbit(
         ),
     ] = None,
     crossing: Annotated[
-        int, typer.Option(parser=_integer, metavar="INTEGER", help="Which of the branch's passages through theta1.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            parser=_integer, metavar="INTEGER", help="Which of the branch's passages through theta1; 1 if not given."
+        ),
+    ] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -103,13 +159,17 @@ def orbit(
         given, missing = ("theta2", "period") if period is None else ("period", "theta2")
         raise ValueError(f"{missing} must be given with {given}, got {given} alone: a guess is both")
     guess = None if theta2 is None else (_radians("theta2", theta2), number("period", period, positive=True, unit="s"))
+    if crossing is not None and branch is None:
+        raise ValueError(f"crossing must go with branch, got {crossing} alone: give --branch {' or '.join(BRANCHES)}")
+    passage = 1 if crossing is None else crossing
     both = branch is None and guess is None and ratio is None
-    found = {
-        name: dpend.find_orbit(
-            pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=crossing
-        )
-        for name in (BRANCHES if both else (branch,))
-    }
+    with _clock("following the branch" if guess is None else "solving"):
+        found = {
+            name: dpend.find_orbit(
+                pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=passage
+            )
+            for name in (BRANCHES if both else (branch,))
+        }
     records = [_orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()]
     if as_json:
         _print_json({"orbits": records} if both else records[0])
@@ -118,7 +178,7 @@ def orbit(
     return 0 if all(int(orbit.status) == Status.CONVERGED for orbit in found.values()) else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def family(
     branch: Annotated[str, typer.Option(help="in-phase (slow mode) or anti-phase (fast mode).")],
     out: Annotated[
@@ -137,7 +197,8 @@ def family(
     formats = {".csv": _write_family_csv, ".json": _write_json}
     if out is not None:
         check_place("out", out, tuple(formats))
-    found = dpend.follow_family(Pendulum(l1, l2, m1, m2, g), branch)
+    with _clock("following the family"):
+        found = dpend.follow_family(Pendulum(l1, l2, m1, m2, g), branch)
     record = _family_record(found, branch)
     if out is not None:
         with replacing(out) as draft:
@@ -149,7 +210,7 @@ def family(
     return 0 if int(found.status) == Status.CONVERGED else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def atlas(
     max_period: Annotated[float, _numeric(help="The longest period [s].")],
     theta1: Annotated[
@@ -159,6 +220,9 @@ def atlas(
     store: Annotated[
         Path | None, typer.Option(help="Of the whole square: F.json, from which a search that was stopped goes on.")
     ] = None,
+    most_steps: Annotated[
+        float, _numeric(help="Refuse a search that takes more time steps, or stop there: 1e9 take about an hour.")
+    ] = float(MOST_STEPS_OF_SEARCH),
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -171,15 +235,25 @@ def atlas(
         raise ValueError(f"store goes with the whole square, got {store} with theta1: leave out either")
     if out is not None:
         check_place("out", out, (".csv", ".json"))
+        if store is not None and out.resolve() == store.resolve():
+            raise ValueError(f"out must be another file than store, got {out} for both: give another name")
     pendulum = Pendulum(l1, l2, m1, m2, g)
-    if theta1 is not None:
-        found = dpend.find_brake_orbits(pendulum, theta1=_radians("theta1", theta1), max_period=max_period)
-    else:
-        with _bar(sys.stderr.isatty(), "slices") as show:
+    _tell_cost(swinging_pendulum(pendulum), max_period, theta1, most_steps)
+    with _work("slices" if theta1 is None else "million steps") as show:
+        if theta1 is not None:
+            found = dpend.find_brake_orbits(
+                pendulum,
+                theta1=_radians("theta1", theta1),
+                max_period=max_period,
+                most_steps=most_steps,
+                progress=lambda done, planned: show(done / 1e6, planned / 1e6),
+            )
+        else:
             found = dpend.find_brake_families(
                 pendulum,
                 max_period=max_period,
                 store=store,
+                most_steps=most_steps,
                 progress=lambda done, planned, families: show(done, planned),
             )
     if out is not None:
@@ -190,10 +264,45 @@ def atlas(
         _print_atlas(found, theta1, out)
     families = all(family["status"] == Status.CONVERGED.name.lower() for family in found.families)
     solved = families and np.all(found.table["status"] == Status.CONVERGED)
-    return 0 if solved and not found.coverage.suspicious_cells else 1
+    return 0 if solved and not (found.coverage.suspicious_cells or found.coverage.exhausted) else 1
 
 
-@app.command()
+# A search that is expected to take longer says so before it begins [s].
+_LONG = 60.0
+
+
+def _tell_cost(pendulum: Pendulum, max_period: float, theta1: float | None, most_steps: float) -> None:
+    known_period(pendulum, max_period)
+    if theta1 is None:
+        steps = survey.expected_steps(pendulum, max_period)
+    else:
+        steps = expected_steps(pendulum, max_period, _radians("theta1", theta1))
+    if steps <= most_steps and steps * SECONDS_PER_STEP > _LONG:
+        minutes = math.ceil(steps * SECONDS_PER_STEP / 60)
+        print(f"dpend: this takes about {steps:.1g} time steps, some {minutes} minutes", file=sys.stderr)
+
+
+# Seconds between two lines about a search whose standard error is no terminal.
+_BETWEEN_LINES = 15.0
+
+
+@contextlib.contextmanager
+def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
+    """A progress bar on standard error; where that is no terminal a line now and then."""
+    with _bar(_on_terminal(), unit) as show:
+        started = last = time.perf_counter()
+
+        def tell(done: float, planned: float) -> None:
+            nonlocal last
+            show(done, planned)
+            if not _on_terminal() and time.perf_counter() - last > _BETWEEN_LINES:
+                last = time.perf_counter()
+                print(f"dpend: {done:.3g} of about {planned:.3g} {unit}, {last - started:.0f} s", file=sys.stderr)
+
+        yield tell
+
+
+@app.command(cls=_Command)
 def design(
     theta1: _Theta1,
     branch: Annotated[
@@ -226,10 +335,9 @@ def design(
         by_name = dict(zip(branches, orbits, strict=True))
         return jax.numpy.stack([equation(by_name) for equation in equations.values()])
 
-    names = tuple(name.strip() for name in free.split(","))
-    found = dpend.design_pendulum(
-        loss, start, names, branch=branches, theta1=_radians("theta1", theta1), bounds=_bounds(bounds or [])
-    )
+    names, limits, angle = _names(free), _bounds(bounds or []), _radians("theta1", theta1)
+    with _clock("designing"):
+        found = dpend.design_pendulum(loss, start, names, branch=branches, theta1=angle, bounds=limits)
     record = _design_record(found, start, branches, tuple(equations))
     if as_json:
         _print_json(record)
@@ -238,7 +346,11 @@ def design(
     return 0 if int(found.status) == Status.CONVERGED else 1
 
 
-@app.command()
+# Of a motion at order 8 with its second pass, all states saved, on two cores.
+_STEPS_A_SECOND, _BYTES_A_STEP = 5e4, 250
+
+
+@app.command(cls=_Command)
 def simulate(
     theta1: _Theta1,
     theta2: Annotated[float, _numeric(help="Release angle of the lower rod [deg].")],
@@ -253,6 +365,9 @@ def simulate(
     tolerance: Annotated[
         float | None, _numeric(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
     ] = None,
+    most_steps: Annotated[
+        int, typer.Option(parser=_integer, metavar="INTEGER", help="How many steps are taken at most.")
+    ] = MOST_STEPS,
     out: Annotated[Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -265,7 +380,14 @@ def simulate(
     pendulum = Pendulum(l1, l2, m1, m2, g)
     state = State(_radians("theta1", theta1), _radians("theta2", theta2), number("p1", p1), number("p2", p2))
     write = _writer(out) if out is not None else None
-    motion = dpend.simulate(pendulum, state, duration, step=step, method=method, tolerance=tolerance)
+    if step is not None and step > 0 and MOST_STEPS < abs(duration / step) <= most_steps:
+        seconds = abs(duration / step) / _STEPS_A_SECOND
+        _complain(f"{abs(duration / step):,.0f} steps take some {seconds / 60:.0f} minutes and "
+                  f"{_BYTES_A_STEP * seconds * _STEPS_A_SECOND / 1e9:.0f} GB")  # fmt: skip
+    with _clock("integrating"):
+        motion = dpend.simulate(
+            pendulum, state, duration, step=step, method=method, tolerance=tolerance, most_steps=most_steps
+        )
     if write is not None:
         write(motion)
     record = _motion_record(motion)
@@ -276,7 +398,7 @@ def simulate(
     return 0 if int(motion.status) == Status.CONVERGED else 1
 
 
-@app.command(name="map")
+@app.command(name="map", cls=_Command)
 def map_command(
     quantity: Annotated[str, typer.Argument(help="lyapunov, megno, flip or drift.")],
     size: Annotated[str, typer.Option(metavar="N|NxM", help="Cells along theta1 and theta2.")],
@@ -292,6 +414,9 @@ def map_command(
     error: Annotated[
         str | None, typer.Option(help="half-step: a second pass at half the step, and an error for each cell.")
     ] = None,
+    most_steps: Annotated[
+        float, _numeric("--most-steps", help="Refuse a map of more steps, or a motion of more than a millionth of it.")
+    ] = 1e12,
     figure: Annotated[Path | None, typer.Option(help="Draw the map into P.png.")] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -303,6 +428,8 @@ def map_command(
     """A map of the square of releases from rest: chaos, first flips or energy drift, cell by cell."""
     if quantity not in _MAPS:
         raise ValueError(f"map must be one of {', '.join(_MAPS)}, got {quantity!r}")
+    if method is not None and method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     duration = number("duration", duration, positive=True, unit="s")
     axes = {
         key: _cells(key, text, count)
@@ -312,7 +439,7 @@ def map_command(
     if figure is not None:
         check_place("figure", figure, (".png",))
     started, counts = time.perf_counter(), [0, 0, 0]
-    with _bar(sys.stderr.isatty(), "cells") as show:
+    with _complaints_of_stores(), _bar(_on_terminal(), "cells") as show:
 
         def tell(*now: int) -> None:
             counts[:] = now
@@ -328,13 +455,15 @@ def map_command(
             error=error,
             store=out,
             progress=tell,
+            announce=_announce,
+            most_steps=most_steps,
         )
     seconds = time.perf_counter() - started
-    status = field["status"].values
+    done, failed = _counts(field["status"])
     record = {
-        "cells": int(status.size),
-        "done": int(np.sum(status != Status.NOT_COMPUTED)),
-        "failed": int(np.sum((status != Status.NOT_COMPUTED) & (status != Status.CONVERGED))),
+        "cells": int(field["status"].size),
+        "done": done,
+        "failed": failed,
         "seconds": seconds,
         "steps_per_second": counts[2] / seconds,
         "scheme": {"method": field.attrs["method"], "step_s": field.attrs["step"]},
@@ -351,7 +480,7 @@ def map_command(
     return 0
 
 
-@app.command()
+@app.command(cls=_Command)
 def animate(
     theta1: Annotated[list[float], _numeric("--theta1", help="Release angle of the upper rod [deg]; once a release.")],
     theta2: Annotated[list[float], _numeric("--theta2", help="Release angle of the lower rod [deg]; once a release.")],
@@ -379,7 +508,7 @@ def animate(
         for one, two in zip(theta1, theta2, strict=True)
     ]
     motions = animation.motions_for(pendulum, releases, duration, speed=speed)
-    with _bar(sys.stderr.isatty(), "frames") as show:
+    with _bar(_on_terminal(), "frames") as show:
         frames = animation.film(pendulum, motions, out, progress=show)
     records = [_motion_record(motion) for motion in motions]
     record = {
@@ -398,7 +527,7 @@ def animate(
     return 0 if all(int(motion.status) == Status.CONVERGED for motion in motions) else 1
 
 
-@app.command()
+@app.command(cls=_Command)
 def fit(
     data: Annotated[Path, typer.Argument(help="A CSV file with columns time_s, theta1_deg, theta2_deg.")],
     free: Annotated[str, typer.Option(help="What to estimate, of l1, l2, m1, m2, g; the rest is held.")] = "l2,m2,g",
@@ -417,17 +546,21 @@ def fit(
     """The pendulum whose motion is nearest to measured angles, from a guess of it; one rod or single cells may lack."""
     if figure is not None:
         check_place("figure", figure, (".png",))
+        if figure.resolve() == data.resolve():
+            raise ValueError(f"figure must be another file than data, got {figure} for both: give another name")
     sigma = None if noise is None else math.radians(number("noise", noise, positive=True, unit="deg"))
+    names = _names(free)
     times, theta1, theta2 = dpend.load_angles(data)
-    found = dpend.fit_parameters(
-        times,
-        theta1,
-        theta2,
-        pendulum=Pendulum(l1, l2, m1, m2, g),
-        free=tuple(name.strip() for name in free.split(",") if name.strip()),
-        initial=(None, None, 0.0, 0.0) if at_rest else (None,) * 4,
-        noise=sigma,
-    )
+    with _clock("fitting"):
+        found = dpend.fit_parameters(
+            times,
+            theta1,
+            theta2,
+            pendulum=Pendulum(l1, l2, m1, m2, g),
+            free=names,
+            initial=(None, None, 0.0, 0.0) if at_rest else (None,) * 4,
+            noise=sigma,
+        )
     if figure is not None:
         _draw_fit(found, figure)
     record = _fit_record(found)
@@ -455,6 +588,9 @@ def _asked(
         raise ValueError(f"branch must be given with period and kappa, got none: give {' or '.join(BRANCHES)}")
     if branch is not None and branch not in BRANCHES:
         raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    if branch is not None and period is None and kappa is None:
+        raise ValueError(f"branch must go with period or kappa, got {branch!r} with ratio alone, which is of both: "
+                         "leave it out")  # fmt: skip
     equations: dict[str, Callable[[dict[str, PeriodicOrbit]], Any]] = {}
     if period is not None:
         seconds = float(number("period", period, positive=True, unit="s"))
@@ -468,13 +604,20 @@ def _asked(
     return equations, BRANCHES if ratio is not None else (str(branch),)
 
 
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    if "" in names:
+        raise ValueError(f"free must be names with commas between them, got {text!r}: give them like l2,m2")
+    return names
+
+
 def _bounds(texts: list[str]) -> dict[str, tuple[float, float]]:
     """Bounds by name, of theta1 in radians."""
     bounds = {}
     for text in texts:
         name, _, span = text.partition("=")
         try:
-            low, high = (float(part) for part in span.split(":"))
+            low, high = (parse_decimal(part) for part in span.split(":"))
         except ValueError:
             raise ValueError(f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5") from None
         if name in bounds:
@@ -495,9 +638,52 @@ _MAPS = {
 _MOST_CELLS = 65536
 
 
+# What is told before it is spent: more seconds, or bytes.
+_LONG, _LARGE = 60.0, 1e9
+
+
+def _announce(cost: Cost) -> None:
+    if cost.seconds > _LONG or cost.bytes > _LARGE:
+        _complain(
+            f"{cost.cells} cells to compute, about {cost.steps:.1e} steps, which may take {cost.seconds / 60:.0f} "
+            f"minutes, and values of {cost.bytes / 1e9:.2g} GB; stopped and started again, it goes on"
+        )
+
+
+@contextlib.contextmanager
+def _complaints_of_stores() -> Iterator[None]:
+    """Warnings about a store in one line each."""
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def tell(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, StoreWarning):
+                _complain(str(message))
+            else:
+                show(message, category, *where, **more)
+
+        warnings.simplefilter("always", StoreWarning)
+        warnings.showwarning = tell
+        yield
+
+
+# Rows of a map that are read at once, to be counted.
+_ROWS = 256
+
+
+def _counts(status: Any) -> tuple[int, int]:
+    """How many cells are done, and how many of them failed."""
+    done = failed = 0
+    for start in range(0, status.shape[0], _ROWS):
+        rows = status[start : start + _ROWS].values
+        done += int(np.sum(rows != Status.NOT_COMPUTED))
+        failed += int(np.sum((rows != Status.NOT_COMPUTED) & (rows != Status.CONVERGED)))
+    return done, failed
+
+
 def _size(text: str) -> tuple[int, int]:
     sides = text.lower().split("x")
-    if len(sides) > 2 or not all(side.isdigit() and int(side) > 0 for side in sides):
+    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,99}", side) and int(side) for side in sides):
         raise ValueError(f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like 512x256")
     cells = int(sides[0]), int(sides[-1])
     if max(cells) > _MOST_CELLS:
@@ -515,6 +701,10 @@ def _cells(name: str, text: str, count: int) -> np.ndarray:
         raise ValueError(f"{name} must be a range A:B with A below B, got {text!r}: give one like -180:180")
     centres = np.radians(start + (np.arange(count) + 0.5) * ((end - start) / count))
     return 0.5 * (centres - centres[::-1]) if start == -end else centres
+
+
+def _on_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()
 
 
 @contextlib.contextmanager
@@ -539,6 +729,21 @@ def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
             progress.update(task, completed=done, total=total, rate=f"{millions:.1f} M steps/s" if steps else "")
 
         yield show
+
+
+@contextlib.contextmanager
+def _clock(doing: str) -> Iterator[None]:
+    """What is being done and for how long, on a terminal: for what cannot tell how far it is."""
+    if not _on_terminal():
+        yield
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = SpinnerColumn(), TextColumn(doing), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        progress.add_task("", total=None)
+        yield
 
 
 # --- what is printed -------------------------------------------------------------------------------------------------
@@ -620,7 +825,8 @@ def _motion_record(motion: Trajectory) -> dict[str, Any]:
         "method": motion.scheme.name,
         "step_s": abs(float(motion.time[-1])) / int(motion.steps),
         "status": status.name.lower(),
-        "message": dpend.message(status),
+        "tolerance": float(motion.tolerance),
+        "message": motion.message,
     }
 
 
@@ -692,8 +898,20 @@ def _print_json(record: dict[str, Any]) -> None:
     print(json_text(record))
 
 
-def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
+# Wider than any table here: a number is never broken to fit a terminal.
+_TABLE_WIDTH = 200
+
+
+def _print_table(table: "Table") -> None:
     from rich.console import Console
+
+    console = Console(width=_TABLE_WIDTH, highlight=False)
+    with console.capture() as text:
+        console.print(table)
+    print(text.get(), end="")
+
+
+def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
     from rich.table import Table
 
     table = Table(title=_described(pendulum), title_justify="left", title_style="")
@@ -714,7 +932,7 @@ def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) ->
         )
         if record["status"] != "converged":
             failures.append(f"{name or 'guess'}: {record['status']}: {record['message']}")
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     for failure in failures:
         print(failure)
 
@@ -724,7 +942,6 @@ _SHOWN_POINTS = 12
 
 
 def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     pendulum = Pendulum(*record["pendulum"].values())
@@ -749,7 +966,7 @@ def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None
             "0" if marginal else f"{row['log_abs_kappa']:.5g}",
             row["kind"],
         )
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     worst = max(point["theta2_error_deg"] for point in points)
     print(f"{len(points)} orbits from {family.ends[0]} to {family.ends[1]}; error of theta2 at most {worst:.0e} deg")
     if int(family.status) != Status.CONVERGED:
@@ -759,7 +976,6 @@ def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None
 
 
 def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title=_described(atlas.pendulum), title_justify="left", title_style="")
@@ -774,11 +990,13 @@ def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> 
         table.add_column(heading, justify="left" if heading in _WORDS else "right")
     for row in rows:
         table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     seen = atlas.coverage
     print(f"{what} and periods of at most {atlas.max_period:g} s", end="; ")
     print(f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, {seen.time_points} times")
     agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
+    if seen.exhausted:
+        print("STOPPED at the most time steps allowed: more is likely to be missing; raise --most-steps")
     print(f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding number {agree}")
     if out is not None:
         print(f"written to {out}")
@@ -831,7 +1049,6 @@ def _described(pendulum: Pendulum) -> str:
 
 
 def _print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, theta1: float) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     branches = (orbit["branch"] for orbit in record["orbits"])
@@ -850,7 +1067,7 @@ def _print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, 
         slopes = [orbit["sensitivities"][key][name] for orbit in record["orbits"] for key in _SLOPES]
         row = [f"{float(before):g}", f"{float(after):.10g}", *(f"{slope:.6g}" for slope in slopes)]
         table.add_row(f"{name} ({unit})", *row)
-    Console(width=None if sys.stdout.isatty() else 120, highlight=False).print(table)
+    _print_table(table)
     missed = ", ".join(f"{name} {value:.0e}" for name, value in record["missed"].items())
     print(f"{record['iterations']} steps, {record['looks']} solves; misses {missed}; logarithms changed by", end=" ")
     print(f"{record['distance']:.6g}" + (f"; at bounds: {', '.join(found.at_bounds)}" if found.at_bounds else ""))
@@ -952,10 +1169,12 @@ def _keep_compiled_code() -> None:
     """Has JAX keep compiled code in the user's cache directory, or where the user chose: later runs start warm."""
     if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         return
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dpend"
+    chosen = os.environ.get("XDG_CACHE_HOME", "")
     try:
+        # A relative path is no place at all: the XDG specification has it ignored.
+        base = Path(chosen if os.path.isabs(chosen) else Path.home() / ".cache") / "dpend"
         base.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # nowhere to write, or a user without a home
         return
     if os.access(base, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(base))
@@ -963,33 +1182,76 @@ def _keep_compiled_code() -> None:
 
 
 def _complain(text: str) -> None:
-    print("dpend: " + " ".join(text.split()), file=sys.stderr)
+    if sys.stderr is not None:  # the shell may have closed it
+        print("dpend: " + " ".join(text.split()), file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The entry point: runs one command and exits with its status."""
-    sys.exit(_run(sys.argv[1:] if arguments is None else list(arguments)))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
+    os.environ.pop("MPLBACKEND", None)  # for windows, of which the program opens none
+    warnings.filterwarnings("ignore", message=".*persistent compilation cache")  # a cache only saves time
+    catch_interrupts()
+    status = _run(sys.argv[1:] if arguments is None else list(arguments))
+    leave_quietly()
+    if _flush() is not None:  # Python would try once more when it ends, and say so with a traceback
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(status)
+
+
+def _flush() -> OSError | None:
+    """Writes what was printed; why it could not be, if so."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        return error
+    return None
 
 
 def _run(arguments: list[str]) -> int:
-    # The process is this program's own, so that float64 is ours to switch on even where JAX is to be left plain.
-    if "JAX_ENABLE_X64" not in os.environ:
-        jax.config.update("jax_enable_x64", True)
-    _keep_compiled_code()
     try:
+        # The process is this program's own, so that float64 is ours to switch on even where JAX is to be left plain.
+        if "JAX_ENABLE_X64" not in os.environ:
+            jax.config.update("jax_enable_x64", True)
+        _keep_compiled_code()
         with np.errstate(all="ignore"):  # what overflows is told by the status or by the line that refuses it
-            return int(app(arguments or ["--help"], standalone_mode=False) or 0)
+            status = int(app(arguments or ["--help"], standalone_mode=False) or 0)
+        lost = _flush()
+        if isinstance(lost, BrokenPipeError):
+            return 141
+        if lost is not None:
+            return _tell(lost)
+        return status
     except (KeyboardInterrupt, typer.Abort):
         return 130
+    except (BrokenPipeError, SystemExit):  # the latter is typer's answer to a closed pipe, and to nothing else here
+        return 141
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:
-        # The command line's own errors know how to name the option they are about.
-        usage = getattr(error, "format_message", None)
-        if usage is None and not isinstance(error, (ValueError, OSError, RuntimeError)):
-            raise
-        _complain(usage() if usage else str(error))
-        return 1 if usage is None and isinstance(error, RuntimeError) else 2
+        return _tell(error)
+
+
+def _tell(error: Exception) -> int:
+    """One line about an error, and the exit status; a fault of this program is raised again."""
+    # The command line's own errors know how to name the option they are about.
+    usage = getattr(error, "format_message", None)
+    if usage is not None:
+        _complain(usage())
+        return 2
+    if isinstance(error, MemoryError):
+        _complain(f"there is not enough memory ({error}): give fewer steps, cells or points")
+        return 1
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
+        _complain(f"{error.filename or 'standard output'} cannot be written ({error.strerror}): make room for it")
+        return 1
+    if not isinstance(error, (ValueError, OSError, RuntimeError)):
+        raise error
+    _complain(str(error))
+    return 1 if isinstance(error, RuntimeError) else 2
 
 
 if __name__ == "__main__":

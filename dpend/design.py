@@ -26,10 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.families import known_pendulum
-from dpend.orbits import BRANCHES, PeriodicOrbit, find_orbit, slopes
-from dpend.pendulum import Pendulum, Scalar, hamiltonian, released
-from dpend.trajectory import Status, known_number, message
+from dpend.checks import function, integer, is_traced, known_number, one_of, several, shown
+from dpend.orbits import BRANCHES, PeriodicOrbit, find_orbit, slopes, swinging_pendulum
+from dpend.pendulum import Pendulum, Scalar, check_pendulum, hamiltonian, released
+from dpend.trajectory import Status, message
 
 Loss = Callable[..., Any]
 GOALS = ("zero", "minimum")
@@ -544,21 +544,16 @@ def design_pendulum(
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, theta1))):
+    function("loss", loss, "an orbit", "lambda orbit: orbit.kappa")
+    check_pendulum(pendulum)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((pendulum, theta1))):
         raise ValueError("pendulum and theta1 must be numbers, not traced by jit or a derivative: design outside of it")
-    if not isinstance(pendulum, Pendulum):
-        raise ValueError(f"pendulum must be a Pendulum, got {type(pendulum).__name__}")
-    start = known_pendulum(pendulum)
+    start = swinging_pendulum(pendulum)
     branches, angles = _orbits_asked(branch, theta1)
     names = _names(free)
     if "theta1" in names and not np.isscalar(theta1) and len(angles) > 1:
         raise ValueError(f"theta1 can be free only if it is one angle, got {len(angles)}: leave it out of free")
-    if goal not in GOALS:
-        raise ValueError(f"goal must be one of {', '.join(GOALS)}, got {goal!r}")
-    if isinstance(max_iterations, bool) or not isinstance(max_iterations, int) or max_iterations < 1:
-        raise ValueError(f"max_iterations must be an integer of at least 1, got {max_iterations!r}")
-    if not callable(loss):
-        raise ValueError(f"loss must be a function of an orbit, got {loss!r}: give one like lambda orbit: orbit.kappa")
+    goal, max_iterations = one_of("goal", goal, GOALS), integer("max_iterations", max_iterations)
     values = dict(zip(PARAMETERS, [*jax.tree.leaves(start), angles[0]], strict=True))
     low, high = _box(values, names, bounds)
     problem = _Problem(loss, start, branches, angles, low, high)
@@ -582,25 +577,33 @@ def design_pendulum(
 def _orbits_asked(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
     """Branches and angles, one each for every orbit."""
     branches = (branch,) if isinstance(branch, str) else branch
-    if not isinstance(branches, Sequence) or not branches or any(one not in BRANCHES for one in branches):
-        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, or a sequence of them, got {branch!r}")
-    several = isinstance(theta1, (Sequence, np.ndarray)) and not isinstance(theta1, str) and np.ndim(theta1) > 0
-    angles = tuple(theta1) if several else (theta1,) * len(branches)
+    if not isinstance(branches, Sequence) or not branches:
+        raise ValueError(
+            f"branch must be one of {', '.join(BRANCHES)}, or a sequence of them, got {shown(branch)}: give such"
+        )
+    branches = tuple(one_of("branch", one, BRANCHES) for one in branches)
+    listed = isinstance(theta1, (list, tuple)) or (isinstance(theta1, (np.ndarray, jax.Array)) and theta1.ndim > 0)
+    angles = tuple(theta1) if listed else (theta1,) * len(branches)
     if len(angles) != len(branches):
-        raise ValueError(f"theta1 must be one angle, or one a branch, got {len(angles)} for {len(branches)} branches")
+        raise ValueError(
+            f"theta1 must be one angle, or one a branch, got {len(angles)} for {len(branches)}: give {len(branches)}"
+        )
     known = tuple(known_number("theta1", angle, unit="rad") for angle in angles)
     for angle in known:
         if not 0 < angle < _LARGEST_ANGLE:
             raise ValueError(f"theta1 must be between 0 and pi [rad], got {angle:g}: give another theta1")
-    return tuple(branches), known
+    return branches, known
 
 
 def _names(free: Any) -> tuple[str, ...]:
     names = (free,) if isinstance(free, str) else free
-    if not isinstance(names, Sequence) or not names or any(name not in PARAMETERS for name in names):
-        raise ValueError(f"free must name one or more of {', '.join(PARAMETERS)}, got {free!r}")
+    sound = isinstance(names, Sequence) and all(isinstance(name, str) and name in PARAMETERS for name in names)
+    if not sound or not names:
+        raise ValueError(
+            f"free must name one or more of {', '.join(PARAMETERS)}, got {shown(free)}: give names like ('l1', 'l2')"
+        )
     if len(set(names)) < len(names):
-        raise ValueError(f"free must name each parameter once, got {free!r}")
+        raise ValueError(f"free must name each parameter once, got {shown(free)}: leave one out")
     return tuple(names)
 
 
@@ -608,7 +611,7 @@ def _box(values: dict[str, float], names: tuple[str, ...], bounds: Any) -> tuple
     """The bounds of x."""
     given = {} if bounds is None else bounds
     if not isinstance(given, Mapping):
-        raise ValueError(f"bounds must be a dictionary like {{'l1': (0.1, 0.5)}}, got {bounds!r}")
+        raise ValueError(f"bounds must be a dictionary like {{'l1': (0.1, 0.5)}}, got {shown(bounds)}: give one")
     low, high = np.zeros(len(PARAMETERS)), np.zeros(len(PARAMETERS))
     for name in given:
         if name not in names:
@@ -618,8 +621,7 @@ def _box(values: dict[str, float], names: tuple[str, ...], bounds: Any) -> tuple
         pair = given.get(name, (start / _FACTOR, start * _FACTOR))
         if name == "theta1" and name not in given:
             pair = (start / _FACTOR, max(start, min(start * _FACTOR, _LARGEST_WITHOUT_BOUNDS)))
-        if isinstance(pair, str) or np.shape(pair) != (2,):
-            raise ValueError(f"bounds of {name} must be a pair (low, high), got {pair!r}")
+        pair = several(f"bounds of {name}", pair, "a pair (low, high)", 2)
         least, most = (known_number(f"bounds of {name}", bound, positive=True) for bound in pair)
         if not least < most or not least <= start <= most:
             raise ValueError(

@@ -1,26 +1,44 @@
 """The first time at which a function of the state crosses zero, exact to the integration method.
 
-A crossing shows as a change of sign over a step. The step is then taken again from the state before it, as a step of
-the same method whose length is found by Newton's method so that it lands on the crossing: no interpolant, whose own
-error would be another. Two crossings inside one step cancel and are not seen.
+Values and slopes at both ends of each step tell whether a function may cross zero inside it: it changes sign, or it
+heads for zero, turns back, and a cubic through those four numbers comes near zero between. Only such steps are looked
+into. There the step is taken again from the state before it, as a step of the same method of another length: no
+interpolant, whose own error would be another. A bracket of the change of sign is kept all along, so that what comes out
+is a root, or nothing. Where nothing comes out (the function jumps, has a pole, or turns back before zero) the search
+goes on behind that step.
+
+A function lies on zero where it is no larger than the rounding errors of the state make it. What lies there at t = 0
+has the sign that it takes when it leaves; what is still on its way there at the end crosses at the end.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from dpend.pendulum import Pendulum, Scalar, State, vector_field
-from dpend.steppers import Scheme
+from dpend.checks import function, known_number, one_of
+from dpend.pendulum import Pendulum, Scalar, State, check_motion, vector_field
+from dpend.steppers import Scheme, check_scheme
 from dpend.trajectory import fold
 
-# Newton's method from the end of a step needs five or six; each bisection of the bracket takes one more.
-_MOST_ITERATIONS = 40
-# Of the step: an update this small leaves, squared, nothing for the next.
-_TIME_TOLERANCE = 1e-8
+# Newton's method takes three or four; a jump, which is bisected to the last bit, some 60.
+_MOST_ITERATIONS = 120
+_EPSILON = float(np.finfo(np.float64).eps)
+# A value of so many rounding errors of the state counts as zero.
+_ROUNDING = 8.0
+# A step is looked into where the cubic's bottom lies above zero by this share of its depth below the step's ends. The
+# cubic's error is (omega h)^2/12 of the depth for a swing of frequency omega: a swing is seen up to omega h = 1.2.
+_MARGIN = 0.125
+# Steps that are kept to be looked into in one pass. Where all of them disappoint, the next pass begins behind them: so
+# seldom, with two, that a first-flip map does not feel it.
+_SLOTS = 2
+# A step that crosses in the motion and not when taken again (the circle forms then begin on their circle) is lengthened
+# by this share of itself.
+_BEYOND = 1 / 64
 
 
 class Crossing(NamedTuple):
@@ -39,132 +57,399 @@ class Crossing(NamedTuple):
     steps: Scalar
 
 
-class _Search(NamedTuple):
-    """What is known along the way. The state before the crossing, and when and how long the step was that crossed,
-    stand still once it is found.
+class _Start(NamedTuple):
+    """A function at a step's start: its sign, its value, its change over the step at the rate
+    there; and whether the step changes its sign.
     """
 
-    found: Scalar
-    values: jax.Array
+    sign: Scalar
+    value: Scalar
+    change: Scalar
+    crossed: Scalar
+
+
+class _Step(NamedTuple):
+    """A step to look into: the state before it, its end and length [s], and every function."""
+
     before: State
     time: Scalar
     dt: Scalar
+    starts: tuple[_Start, ...]
+
+
+class _Search(NamedTuple):
+    """What is known along the way.
+
+    `values`, `rates` [1/s] and `signs` are those of the functions after the last step; a sign is
+    zero as long as there is none. They are scalars: XLA computes those of many lanes side by side,
+    and arrays of a few numbers not. `closed`: the last of the slots changes a sign, so that no later
+    step is asked for.
+    """
+
+    values: tuple[Scalar, ...]
+    rates: tuple[Scalar, ...]
+    signs: tuple[Scalar, ...]
+    state: State
+    slots: tuple[_Step, ...]
+    count: Scalar
+    closed: Scalar
     steps: Scalar
 
 
-def first_crossing(
-    functions: Callable[[Pendulum, State], Any],
-    pendulum: Pendulum,
-    state: State,
-    duration: float,
-    scheme: Scheme,
-    *,
-    direction: int = 0,
-) -> Crossing:
-    """The first time 0 < t <= duration at which one of `functions` crosses zero.
+class _Pass(NamedTuple):
+    """What one motion from start to end finds. Steps up to `floor` [s] are known to hold nothing."""
 
-    A function that is zero at t = 0 starts with the sign it takes after the first step.
+    floor: Scalar
+    again: Scalar
+    crossing: Crossing
+
+
+class _Task(NamedTuple):
+    """A function to follow in a step, and the phase in which that begins."""
+
+    index: Scalar
+    phase: Scalar
+    before: State
+    time: Scalar
+    dt: Scalar
+    start: _Start
+
+
+# What a probe does next: see whether it is at zero before the step, try the step's end, look for a
+# turn, close in on a root, judge it; or it is done.
+_ARRIVE, _END, _TURN, _ROOT, _LAST, _FOUND, _NONE = range(7)
+
+
+class _Sample(NamedTuple):
+    """A function inside a step: where [steps], its value, its change over a step at that rate."""
+
+    share: Scalar
+    value: Scalar
+    change: Scalar
+
+
+class _Probe(NamedTuple):
+    """One function inside one step.
+
+    It has `sign` at `low` and, in the phase of the root, the other one at `high`; `share` is what is
+    tried next, `last` the length of the last move, `largest` the larger value at the step's ends.
+    """
+
+    phase: Scalar
+    share: Scalar
+    low: _Sample
+    high: _Sample
+    sign: Scalar
+    last: Scalar
+    largest: Scalar
+    count: Scalar
+
+    def between(self, phase: Scalar, low: _Sample, high: _Sample) -> "_Probe":
+        return self._replace(phase=jnp.asarray(phase), low=low, high=high, last=high.share - low.share)
+
+
+def first_crossing(
+    functions: Callable[[Pendulum, State], Any] | Any,
+    pendulum: Pendulum | Any,
+    state: State | Any,
+    duration: float | Any,
+    scheme: Scheme | Any,
+    *,
+    direction: int | Any = 0,
+) -> Crossing:
+    """The first time 0 < t <= duration at which one of `functions` changes sign continuously.
+
+    A state on the section, within rounding, leaves it first: the crossing that it is at does not count, the next does,
+    however soon. A crossing within rounding of `duration` counts. A function that touches zero does not cross it, nor
+    does one that jumps over it or is not a number there; what it does later counts.
+
+    Two crossings in one step are seen where a cubic through values and slopes at its ends shows them, that is of
+    functions that swing no faster than five steps a swing resolve. Of three crossings in one step one is seen; two are
+    not seen where the function turns once more in that step.
+
+    Forward derivatives, those of `time` and `state` with respect to pendulum and state, are those of the implicit
+    function theorem.
 
     Arguments:
         functions: (pendulum, state) -> one scalar, or a tuple of scalars each of which is watched; smooth where it
             crosses. Compiled functions are kept by its identity: define it once, not in a loop.
         pendulum, state, scheme: as for `flow`.
         duration: how long to look [s], a number; negative runs backwards.
-        direction: 1 counts crossings from below only, -1 from above only, 0 both.
+        direction: 1 counts crossings from below only, -1 from above only, 0 both; as the motion is followed, which for
+            a negative duration is backwards.
     Returns:
         Crossing.
     Raises:
         ValueError: direction is none of these; as `flow`.
     """
-    if direction not in (-1, 0, 1):
-        raise ValueError(f"direction must be -1, 0 or 1, got {direction!r}")
-    return _first_crossing(functions, pendulum, state, float(duration), scheme, direction)
-
-
-class _Landing(NamedTuple):
-    """Where the crossing lies inside its step: a bracket and Newton's latest time [s, from the step's start], the
-    functions that cross before the bracket's end, which of them first, and the state at the time last tried.
-    """
-
-    low: Scalar
-    high: Scalar
-    tau: Scalar
-    among: jax.Array
-    which: Scalar
-    state: State
-    close: Scalar
-    done: Scalar
-    count: Scalar
+    function("functions", functions, "(pendulum, state)", "lambda pendulum, state: state.theta2")
+    check_motion(pendulum, state)
+    check_scheme(scheme)
+    duration, direction = known_number("duration", duration, unit="s"), one_of("direction", direction, (-1, 0, 1))
+    return _first_crossing(functions, pendulum, state, duration, scheme, direction)
 
 
 @partial(jax.jit, static_argnames=("functions", "duration", "scheme", "direction"))
 def _first_crossing(functions, pendulum, state, duration, scheme, direction):  # type: ignore[no-untyped-def]
-    def look(search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
-        values = _values(functions, pendulum, state)
-        found = search.found | jnp.any(_crossed(search.values, values, direction))
-        before = jax.tree.map(partial(jnp.where, found), search.before, state)
-        time, dt = jnp.where(search.found, search.time, time), jnp.where(search.found, search.dt, dt)
-        return _Search(found, values, before, time, dt, search.steps + 1.0)
-
+    watch = _Watch(functions, pendulum, scheme, direction)
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), state)
+    step = -scheme.step if duration < 0 else scheme.step
+    start = watch.start(state, step)
+
+    def attempt(last: _Pass) -> _Pass:
+        search = fold(partial(watch.look, last.floor), start, pendulum, state, duration, scheme)
+        # Where the slots do not hold all that there is to look into, a further pass may be needed.
+        more = search.closed | (search.count == _SLOTS)
+        none = Crossing(last.crossing.time + jnp.inf, search.state, jnp.asarray(-1), search.steps)
+        tasks = _tasks(search, more, duration, step)
+        crossing, _ = lax.scan(partial(watch.settle, duration), none, tasks)
+        times = [jnp.where(search.count > i, jnp.abs(slot.time), 0.0) for i, slot in enumerate(search.slots)]
+        return _Pass(jnp.max(jnp.stack(times)), more & (crossing.which < 0), crossing)
+
     zero = jnp.zeros_like(state.theta1)
-    start = _Search(zero > 0, _values(functions, pendulum, state), state, zero, zero, zero)
-    search = fold(look, start, pendulum, state, duration, scheme)
-    return _landed(functions, pendulum, search, scheme, direction)
+    first = _Pass(zero, zero == 0, Crossing(zero, state, jnp.asarray(-1), zero))
+    return lax.while_loop(lambda last: last.again, attempt, first).crossing
 
 
-def _values(functions: Callable[[Pendulum, State], Any], pendulum: Pendulum, state: State) -> jax.Array:
-    return jnp.stack([jnp.asarray(value, jnp.float64) for value in jax.tree.leaves(functions(pendulum, state))])
+def _tasks(search: _Search, more: Scalar, duration: float, step: float) -> _Task:
+    """All functions in the steps to look into, then all in the step that begins at the end."""
+    tasks = []
+    for slot in search.slots:
+        for index, start in enumerate(slot.starts):
+            phase = jnp.where((start.sign != 0) & (slot.dt != 0), _END, _NONE)
+            tasks.append(_Task(jnp.asarray(index), phase, slot.before, slot.time, slot.dt, start))
+    functions = zip(search.signs, search.values, search.rates, strict=True)
+    for index, (sign, value, rate) in enumerate(functions):
+        phase = jnp.where(more | (sign == 0), _NONE, _ARRIVE)
+        start = _Start(sign, value, rate * step, sign > 2)
+        beyond = jnp.asarray(duration + step), jnp.asarray(step)
+        tasks.append(_Task(jnp.asarray(index), phase, search.state, *beyond, start))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
 
 
-def _crossed(before: jax.Array, after: jax.Array, direction: int) -> jax.Array:
-    """Where the sign has changed in the direction asked for; a start at zero and NaN are no change."""
-    changed = (jnp.sign(before) * jnp.sign(after) <= 0) & (before != 0)  # the values' product may underflow
-    return changed if direction == 0 else changed & (before * direction < 0)
+def _choose(condition: Scalar, this: Any, other: Any) -> Any:
+    return jax.tree.map(partial(jnp.where, condition), this, other)
 
 
-def _landed(functions, pendulum, search, scheme, direction):  # type: ignore[no-untyped-def]
-    """The crossing inside the step that starts at search.before: a bracket of the earliest change of sign of any
-    function, and inside it Newton's method on the function that changes first.
+class _Measure(NamedTuple):
+    """The functions at a state, shape (functions,): values, changes over one whole step at the rate
+    there, and what rounding leaves uncertain of the values.
     """
-    unit, point = scheme.constants(pendulum), scheme.enter(pendulum, search.before)
-    start, sense = _values(functions, pendulum, search.before), jnp.sign(search.dt)
 
-    def values(state: State) -> tuple[jax.Array, jax.Array]:
-        """The functions and their rates of change along the motion."""
-        field = vector_field(pendulum, state)
-        return jax.jvp(lambda x: _values(functions, pendulum, x), (state,), (field,))
+    value: jax.Array
+    change: jax.Array
+    rounding: jax.Array
 
-    def newton(carry: _Landing) -> _Landing:
-        tau = carry.tau
-        state = scheme.leave(unit, scheme.move(scheme.lasting(unit, tau), point))
-        here, slopes = values(state)
-        crossed = _crossed(start, here, direction)
-        late = jnp.any(crossed)
-        low, high = jnp.where(late, carry.low, tau), jnp.where(late, tau, carry.high)
-        among = jnp.where(late, crossed, carry.among)
-        there = jnp.where(here == 0, tau, tau - here / slopes)
-        aims = jnp.where(among, sense * there, jnp.inf)
-        aims = jnp.where(aims >= sense * low, aims, jnp.inf)
-        soonest = jnp.argmin(aims)
-        which = jnp.where(aims[soonest] < jnp.inf, soonest, jnp.argmax(among))
-        aim = jnp.where(aims[which] < jnp.inf, sense * jnp.minimum(aims[which], sense * high), 0.5 * (low + high))
-        # One evaluation more than the updates need: the state belongs to the time.
-        aim = jnp.where(carry.close, tau, aim)
-        close = jnp.abs(aim - tau) <= _TIME_TOLERANCE * jnp.abs(search.dt)
-        return _Landing(low, high, aim, among, which, state, close, carry.close, carry.count + 1)
 
-    def goes_on(carry: _Landing) -> Scalar:
-        return search.found & ~carry.done & (carry.count < _MOST_ITERATIONS)
+class _Watch(NamedTuple):
+    """What is asked for, and of which motion."""
 
-    # The step's end is tried first: it tells which functions cross.
-    tau = jnp.where(search.found, search.dt, 0.0)
-    among, no = jnp.ones_like(start, bool), jnp.zeros_like(search.found)
-    first = _Landing(0.0 * tau, search.dt, tau, among, jnp.asarray(0), search.before, no, no, jnp.asarray(0))
-    landing = lax.while_loop(goes_on, newton, first)
-    return Crossing(
-        jnp.where(search.found, search.time - search.dt + landing.tau, jnp.inf),
-        landing.state,
-        jnp.where(search.found, landing.which, -1),
-        search.steps,
+    functions: Callable[[Pendulum, State], Any]
+    pendulum: Pendulum
+    scheme: Scheme
+    direction: int
+
+    def values(self, state: State) -> tuple[Scalar, ...]:
+        leaves = jax.tree.leaves(self.functions(self.pendulum, state))
+        return tuple(jnp.asarray(leaf, jnp.float64) for leaf in leaves)
+
+    def measure(self, state: State, dt: Scalar) -> _Measure:
+        """The functions against a step of `dt` [s]."""
+        gradients = [jnp.stack(jax.tree.leaves(row)) for row in jax.jacfwd(self.values)(state)]
+        table = jnp.stack(gradients)  # functions, leaves of the state
+        move = dt * jnp.stack(jax.tree.leaves(vector_field(self.pendulum, state)))
+        size = jnp.abs(jnp.stack(jax.tree.leaves(state))) + jnp.abs(move)
+        rounding = _EPSILON * jnp.sum(jnp.abs(table) * size, axis=1)
+        return _Measure(jnp.stack(self.values(state)), jnp.sum(table * move, axis=1), rounding)
+
+    def counts(self, sign: Scalar) -> Scalar:
+        """Whether a change from this sign is one that is asked for."""
+        return sign != 0 if self.direction == 0 else sign * self.direction < 0
+
+    def start(self, state: State, step: float) -> _Search:
+        """The search at its start. What lies on zero has the sign of its rate."""
+        here = self.measure(state, step)
+        zero = _ROUNDING * here.rounding
+        leaves = jnp.where(jnp.abs(here.change) > zero, jnp.sign(here.change), 0.0)
+        table = jnp.where(jnp.abs(here.value) > zero, jnp.sign(here.value), leaves)
+        values, rates, signs = tuple(here.value), tuple(here.change / step), tuple(table)
+        nothing = jnp.zeros_like(state.theta1)
+        starts = tuple(_Start(sign, nothing, nothing, sign > 2) for sign in signs)
+        slots = (_Step(state, nothing, nothing, starts),) * _SLOTS
+        return _Search(values, rates, signs, state, slots, jnp.asarray(0), nothing > 0, nothing)
+
+    def look(self, floor: Scalar, search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
+        """The `update` of `fold` that notes the steps to look into."""
+        values, rates = jax.jvp(self.values, (state,), (vector_field(self.pendulum, state),))
+        starts, changes, turns = [], [], []
+        both = zip(search.signs, search.values, search.rates, values, rates, strict=True)
+        for sign, before, rate_before, value, rate in both:
+            after = _Sample(1.0, value, dt * rate)
+            crossed, change = _goes_through(sign, after), dt * rate_before
+            starts.append(_Start(sign, before, change, crossed))
+            changes.append(crossed & self.counts(sign))
+            turns.append(_may_dip(sign, _Sample(0.0, before, change), after))
+        closes = reduce(jnp.logical_or, changes)
+        wanted = (closes | reduce(jnp.logical_or, turns)) & (jnp.abs(time) > floor)
+        take = wanted & ~search.closed & (search.count < _SLOTS)
+        step = _Step(search.state, time, dt, tuple(starts))
+        slots = tuple(_choose(take & (search.count == i), step, slot) for i, slot in enumerate(search.slots))
+        signs = tuple(_sign_after(start, value) for start, value in zip(starts, values, strict=True))
+        count, closed = search.count + take.astype(int), search.closed | (take & closes)
+        return _Search(values, rates, signs, state, slots, count, closed, search.steps + 1.0)
+
+    def settle(self, duration: float, crossing: Crossing, task: _Task) -> tuple[Crossing, None]:
+        """The crossing of a task, if it is earlier than the one known."""
+        unit = self.scheme.constants(self.pendulum)
+        point = self.scheme.enter(self.pendulum, task.before)
+
+        def once(carry: tuple[_Probe, State]) -> tuple[_Probe, State]:
+            probe, _ = carry
+            state = self.scheme.leave(unit, self.scheme.move(self.scheme.lasting(unit, probe.share * task.dt), point))
+            measure = jax.tree.map(lambda leaf: leaf[task.index], self.measure(state, task.dt))
+            here = _Sample(probe.share, measure.value, measure.change)
+            return self._follow(probe, here, measure.rounding, task.start.crossed), state
+
+        def goes_on(carry: tuple[_Probe, State]) -> Scalar:
+            return (carry[0].phase < _FOUND) & (carry[0].count < _MOST_ITERATIONS)
+
+        early = jnp.abs(task.time - task.dt) < jnp.abs(crossing.time)
+        first = _first_probe(task)._replace(phase=jnp.where(early, task.phase, _NONE))
+        probe, state = lax.while_loop(goes_on, once, (first, task.before))
+        time = task.time + (probe.share - 1.0) * task.dt
+        nearest = jnp.sign(duration) * jnp.minimum(jnp.abs(time), abs(duration))
+        time = time + lax.stop_gradient(nearest - time)
+        earlier = (probe.phase == _FOUND) & (jnp.abs(time) < jnp.abs(crossing.time))
+        return _choose(earlier, Crossing(time, state, task.index, crossing.steps), crossing), None
+
+    def _follow(self, probe: _Probe, here: _Sample, rounding: Scalar, crossed: Scalar) -> _Probe:
+        """The probe after one more try, which is `here`."""
+        phases = {
+            _ARRIVE: self._arrived(probe, here, rounding),
+            _END: self._enclosed(probe, here, crossed),
+            _TURN: self._descended(probe, here, rounding),
+            _ROOT: _narrowed(probe, here, rounding),
+        }
+        ahead = _judged(probe, here, rounding)
+        for phase, other in phases.items():
+            ahead = _choose(probe.phase == phase, other, ahead)
+        return ahead._replace(count=probe.count + 1)
+
+    def _arrived(self, probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
+        """At the end of the motion: the root that is there, within rounding."""
+        zero = _ROUNDING * rounding
+        arrives = (jnp.abs(here.value) <= zero) & (probe.sign * here.change < -zero) & self.counts(probe.sign)
+        share = here.share - here.value / jnp.where(arrives, here.change, 1.0)
+        return probe._replace(phase=jnp.where(arrives, _LAST, _NONE), share=share)
+
+    def _enclosed(self, probe: _Probe, here: _Sample, crossed: Scalar) -> _Probe:
+        """After the step's end: a bracket of a change of sign, or of a turn before one, or the end of it."""
+        largest = jnp.maximum(probe.largest, jnp.abs(here.value))
+        probe = probe._replace(largest=largest)
+        further = probe._replace(
+            share=jnp.ones_like(probe.share) + _BEYOND,
+            phase=jnp.where(crossed & (here.share <= 1.0), _END, _NONE),
+        )
+        turn = probe.between(_TURN, probe.low, here)
+        turn = turn._replace(share=_bottom(turn.low, turn.high))
+        ahead = _choose(_may_dip(probe.sign, probe.low, here), turn, further)
+        root = probe.between(jnp.where(self.counts(probe.sign), _ROOT, _NONE), probe.low, here)
+        root = root._replace(share=_inverse(root.low, root.high))
+        return _choose(_goes_through(probe.sign, here), root, ahead)
+
+    def _descended(self, probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
+        """On the way to where a function turns back: a bracket as soon as it is through zero by more than rounding, or
+        the end of it where the slope and the bracket's width leave too little to fall.
+        """
+        height = probe.sign * here.value
+        falls = probe.sign * here.change < 0
+        low, high = _choose(falls, here, probe.low), _choose(falls, probe.high, here)
+        ahead = probe.between(_TURN, low, high)
+        middle = 0.5 * (low.share + high.share)
+        slow = ahead.last > 0.5 * probe.last
+        least = jnp.abs(here.change) * ahead.last
+        ahead = ahead._replace(
+            share=jnp.where(slow, middle, _bottom(low, high)),
+            phase=jnp.where(least > jnp.maximum(height, rounding), _TURN, _NONE),
+        )
+        before = probe.between(_ROOT, probe.low, here)
+        behind = probe.between(_ROOT, here, probe.high)._replace(sign=-probe.sign)
+        root = _choose(self.counts(probe.sign), before, behind)
+        root = root._replace(share=_inverse(root.low, root.high))
+        return _choose(height < -rounding, root, ahead)
+
+
+def _first_probe(task: _Task) -> _Probe:
+    start = task.start
+    low = _Sample(jnp.zeros_like(start.value), start.value, start.change)
+    share = jnp.where(task.phase == _END, jnp.ones_like(start.value), 0.0)
+    largest = jnp.maximum(jnp.abs(start.value), _EPSILON * jnp.abs(start.change))
+    return _Probe(task.phase, share, low, low, start.sign, jnp.ones_like(share), largest, jnp.asarray(0))
+
+
+def _narrowed(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
+    """One of Newton's iterations, or where that leaves the bracket or does not halve the move, a bisection.
+
+    After the last, one more of Newton's, whose derivative is that of the root.
+    """
+    height, zero = probe.sign * here.value, jnp.abs(here.value) <= rounding
+    leaves = zero & (probe.sign * here.change > 0)  # the section on which the motion starts
+    through = (height <= 0) & ~leaves
+    low, high = _choose(through, probe.low, here), _choose(through, here, probe.high)
+    flat = here.change == 0
+    newton = here.share - here.value / jnp.where(flat, 1.0, here.change)
+    inside = (newton >= low.share) & (newton <= high.share) & ~flat
+    inside &= jnp.abs(newton - here.share) <= 0.5 * probe.last
+    share = jnp.where(inside, newton, 0.5 * (low.share + high.share))
+    last = jnp.abs(share - here.share)
+    narrow = high.share - low.share <= 4 * _EPSILON
+    close = (zero & ~leaves) | (inside & (last <= 4 * _EPSILON)) | narrow
+    end = newton + lax.stop_gradient(jnp.clip(newton, low.share, high.share) - newton)
+    return probe._replace(
+        phase=jnp.where(close, _LAST, _ROOT), share=jnp.where(close, end, share), low=low, high=high, last=last
     )
+
+
+def _judged(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
+    """Whether it is a root: as small as rounding, and smaller than at the ends of the step, which a pole is not."""
+    small = jnp.abs(here.value) <= _ROUNDING * (rounding + _EPSILON * jnp.abs(here.change))
+    small &= jnp.abs(here.value) <= probe.largest
+    return probe._replace(phase=jnp.where(small, _FOUND, _NONE))
+
+
+def _goes_through(sign: Scalar, after: _Sample) -> Scalar:
+    """Whether the sign has changed; at zero itself the slope tells."""
+    return (sign * after.value < 0) | ((after.value == 0) & (sign * after.change < 0))
+
+
+def _sign_after(start: _Start, value: Scalar) -> Scalar:
+    """A function that is not a number loses its sign: what it does next is a new start."""
+    kept = jnp.where(start.crossed, -start.sign, start.sign)
+    return jnp.where(jnp.isnan(value), 0.0, jnp.where(value == 0, kept, jnp.sign(value)))
+
+
+def _may_dip(sign: Scalar, before: _Sample, after: _Sample) -> Scalar:
+    """Whether a function that keeps its sign heads for zero, turns back, and may be through zero between."""
+    start, end = sign * before.value, sign * after.value
+    falls, rises = sign * before.change, sign * after.change
+    share, rest = falls / (falls - rises), end - start
+    bottom = start + share * (falls + share * (3 * rest - 2 * falls - rises + share * (falls + rises - 2 * rest)))
+    depth = jnp.minimum(start, end) - bottom
+    return (falls < 0) & (rises > 0) & (end > 0) & (bottom <= _MARGIN * depth)
+
+
+def _bottom(low: _Sample, high: _Sample) -> Scalar:
+    """Where the slope is zero if it changes evenly."""
+    return low.share + (high.share - low.share) * low.change / (low.change - high.change)
+
+
+def _inverse(low: _Sample, high: _Sample) -> Scalar:
+    """Where a bracketed root lies by the cubic that gives the share as a function of the value; where that is not
+    monotonic, by the chord, away from both ends.
+    """
+    width, rise = high.share - low.share, high.value - low.value
+    chord = -low.value / rise
+    first, second = rise / (low.change * width), rise / (high.change * width)
+    cubic = chord * ((1 - chord) ** 2 * first + chord * (3 - 2 * chord + (chord - 1) * second))
+    sound = (first > 0) & (first < 3) & (second > 0) & (second < 3) & (cubic > 0) & (cubic < 1)
+    return low.share + width * jnp.where(sound, cubic, jnp.clip(chord, 0.01, 0.99))

@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dpend._runtime import require_float64
+from dpend.checks import known_number, several, shown
 from dpend.measurements import FEWEST, Angles, best_width, checked, local_cubics, wrapped
-from dpend.pendulum import Pendulum, Scalar, State, momenta, normal_modes
-from dpend.trajectory import Status, known_number
+from dpend.pendulum import Pendulum, Scalar, State, known_pendulum, momenta, normal_modes
+from dpend.trajectory import Status
 from dpend.windows import (
     PRICES,
     ROUNDED,
@@ -142,7 +143,7 @@ def _candidates(problem: Problem, start: _Start, settings: Settings, windows: in
         np.pad(cost.reshape(grid[0].shape), ((1, 1), (0, 0)), "wrap"), ((0, 0), (1, 1)), constant_values=np.inf
     )
     lowest = np.min(np.lib.stride_tricks.sliding_window_view(table, (3, 3)), axis=(2, 3)).ravel() >= cost
-    order = np.argsort(np.where(lowest, cost, np.inf))[: min(_STARTS, int(np.sum(lowest)))]
+    order = np.argsort(np.where(lowest, cost, np.inf))[: min(_STARTS, max(int(np.sum(lowest)), 1))]
     return [Point(first[:, i : i + 1], fields) for i in order]
 
 
@@ -273,7 +274,7 @@ def _is_bounded(
         )
         nodes = found.point.nodes + np.tensordot(way, found.step.response, 1)
         aside = solved(shifted, Point(nodes, np.zeros(others.shape[1])), settings)
-        grown = (aside.misses.squares - found.misses.squares) / max(noise, 1e-300) ** 2
+        grown = (aside.misses.squares - found.misses.squares) / max(noise, _LEAST_NOISE) ** 2
         if aside.step is not None and grown < _GROWN:
             return False
     return True
@@ -383,22 +384,21 @@ def fit_parameters(
     Raises:
         ValueError: a free set with the overall length or mass in it, an unknown or repeated name; times that do not
             increase or are too far apart; arrays of other lengths, infinite, with fewer than 7 angles of a rod, or with
-            fewer than there are unknowns; angles that look like degrees; nothing measured at the first time; noise or
-            initial values that are no such numbers; g zero and free.
+            fewer than there are unknowns; angles that look like degrees; nothing measured at the first time; initial
+            values that are no such numbers; noise below 1e-15 or above pi rad; a pendulum with l2/l1 or m2/m1 beyond
+            1e9 or below 1e-9; g zero and free.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    pendulum = Pendulum() if pendulum is None else pendulum
-    if not isinstance(pendulum, Pendulum):
-        raise ValueError(f"pendulum must be a Pendulum, got {pendulum!r:.60}: give dpend.Pendulum(l1=...)")
+    numbers = known_pendulum(Pendulum() if pendulum is None else pendulum)
     names = _checked_free(free)
-    numbers = Pendulum(*(known_number(name, getattr(pendulum, name)) for name in _BY_FIELD))
     if "g" in names and numbers.g == 0:
         raise ValueError(
             "g must not start at 0 where it is free, got 0: give its sign and size by a start above or below"
         )
     held = _checked_initial(initial)
-    sigma = None if noise is None else known_number("noise", noise, positive=True, unit="rad")
+    sigma = None if noise is None else _checked_noise(noise)
+    _check_shape(numbers)
     series = checked(times, theta1, theta2)
     unknowns = len(names) + held.count(None)
     count = int(np.sum(np.isfinite(series.values)))
@@ -411,9 +411,10 @@ def fit_parameters(
 def _checked_free(free: Any) -> tuple[str, ...]:
     names = (free,) if isinstance(free, str) or not hasattr(free, "__iter__") else tuple(free)
     for name in names:
-        if name not in tuple(_BY_FIELD) or names.count(name) > 1:
+        if not isinstance(name, str) or name not in _BY_FIELD or names.count(name) > 1:
+            listed = ", ".join(name if isinstance(name, str) else shown(name) for name in names)
             raise ValueError(
-                f"free must hold each of {', '.join(_BY_FIELD)} once at most, got {', '.join(map(str, names))}"
+                f"free must hold each of {', '.join(_BY_FIELD)} once at most, got {listed}: give names like ('l2', 'g')"
             )
     if {"l1", "l2", "g"} <= set(names):
         raise ValueError("free must not hold l1, l2 and g: only l2/l1 and g/l1 enter the angles: fix one of l1, l2, g")
@@ -422,12 +423,35 @@ def _checked_free(free: Any) -> tuple[str, ...]:
     return names
 
 
-def _checked_initial(initial: Any) -> tuple[float | None, ...]:
-    values = tuple(initial) if hasattr(initial, "__iter__") else (initial,)
-    if len(values) != len(INITIAL):
+# Angles of a radian are rounded by this much [rad], and no motion in doubles is known to less.
+_LEAST_NOISE = 1e-15
+# Of two lengths or masses: beyond this ratio what the lighter or shorter does is lost in rounding, or it overflows.
+_MOST_UNEQUAL = 1e9
+
+
+def _checked_noise(noise: Any) -> float:
+    sigma = float(known_number("noise", noise, positive=True, unit="rad"))
+    if not _LEAST_NOISE <= sigma <= math.pi:
         raise ValueError(
-            f"initial must be {', '.join(INITIAL)}, got {len(values)} values: give None for what is estimated"
+            f"noise must be from {_LEAST_NOISE:g} rad, where doubles round, to pi rad, half a turn, "
+            f"got {sigma:.3g} rad ({math.degrees(sigma):.3g} deg): give that of one angle, or none"
         )
+    return sigma
+
+
+def _check_shape(pendulum: Pendulum) -> None:
+    """Refuses a start from which no search can go on: ratios that doubles cannot hold beside 1."""
+    for over, under in (("l2", "l1"), ("m2", "m1")):
+        ratio = float(getattr(pendulum, over)) / float(getattr(pendulum, under))
+        if not 1 / _MOST_UNEQUAL <= ratio <= _MOST_UNEQUAL:
+            raise ValueError(
+                f"pendulum must have {over}/{under} from {1 / _MOST_UNEQUAL:g} to {_MOST_UNEQUAL:g}, got {ratio:.3g}: "
+                f"give another {over} or {under}"
+            )
+
+
+def _checked_initial(initial: Any) -> tuple[float | None, ...]:
+    values = several("initial", initial, f"{', '.join(INITIAL)}", len(INITIAL))
     return tuple(
         None if value is None else known_number(f"initial {name}", value)
         for name, value in zip(INITIAL, values, strict=True)
@@ -441,7 +465,7 @@ def _fitted(
     by_free = np.array([_BY_FIELD[name] for name in free], float).reshape(-1, 3).T
     problem = laid_out(series, pendulum, by_free, np.array([value is not None for value in initial]), rate)
     start = _smoothed(problem, *series, initial, rate)
-    expected = sigma or start.noise
+    expected = sigma or max(start.noise, _LEAST_NOISE)
     seen_at_first = bool(np.all(start.known[:, 0]))
     searches = [(_window_by_window, first) for first in (_FIRST[:1] if seen_at_first else _FIRST)]
     if np.mean(np.all(start.known, axis=0)) > _MOSTLY:
@@ -471,6 +495,11 @@ def _rate(series: Angles, pendulum: Pendulum) -> float:
         if np.any(there := np.isfinite(column))
     ]
     rate = max(swing, float(np.max(turning)) / _FASTER, 1 / (times[-1] - times[0]))
+    if not math.isfinite(rate):
+        raise ValueError(
+            f"times and pendulum must give finite rates, got l1 = {pendulum.l1:g} m, "
+            f"g = {pendulum.g:g} m/s^2 and times {times[-1] - times[0]:.3g} s long: give SI units"
+        )
     spacing = float(np.median(np.diff(times)))
     if spacing * rate > _COARSEST:
         raise ValueError(
@@ -509,7 +538,8 @@ def _result(
     noisy = _is_noise(residuals, noise, settings.noise, problem.freedom)
     factors = dict(zip(free, np.exp(found.point.fields), strict=True))
     values = {name: np.float64(getattr(pendulum, name) * factors.get(name, 1.0)) for name in _BY_FIELD}
-    best = Pendulum(**{name: jnp.asarray(value) for name, value in values.items()})
+    # Where nothing was fitted these are NaN, which no constructor takes: the status tells.
+    best = jax.tree.unflatten(jax.tree.structure(pendulum), [jnp.asarray(value) for value in values.values()])
     node = found.point.nodes[:, 0]
     ratios = np.array([values["l2"] / values["l1"], values["m2"] / values["m1"], values["g"] / values["l1"]])
     scale = np.append([values[name] for name in free], np.ones(4))

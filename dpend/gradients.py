@@ -23,15 +23,17 @@ from jax.flatten_util import ravel_pytree
 
 from dpend._runtime import require_float64
 from dpend.chaos import Norm, norm
-from dpend.pendulum import Pendulum, Scalar, State
-from dpend.steppers import Scheme
-from dpend.trajectory import Status, known_number, march, step_size
+from dpend.checks import flag, function, known_number, numbers, several, shown
+from dpend.pendulum import Pendulum, Scalar, State, check_motion
+from dpend.steppers import Scheme, check_scheme
+from dpend.trajectory import Status, march, step_size
 
 # Steps of the differences, in units of the parameter: from where four extrapolations make a smooth loss exact to where
 # rounding is all there is.
 _LARGEST_STEP, _RATIO, _LEVELS = 2.0**-5, 4.0, 15
 # A derivative below this share of the loss itself counts as zero.
 _NOTHING = 1e-7
+_MOTION = "(pendulum, state, duration, scheme)"
 # The disagreement that error estimates may hide, in units of them: they are good to a small factor.
 _DOUBT = 10.0
 
@@ -110,8 +112,8 @@ def check_gradient(
     parameters: Any,
     *,
     tolerance: Any = 1e-6,
-    reverse: bool = True,
-    motion: tuple[Any, Any, Any, Any] | None = None,
+    reverse: bool | Any = True,
+    motion: tuple[Any, Any, Any, Any] | Any | None = None,
 ) -> GradientCheck:
     """The derivatives of `loss` at `parameters`, forwards, in reverse, and by finite differences.
 
@@ -134,8 +136,10 @@ def check_gradient(
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    tolerance = known_number("tolerance", tolerance, positive=True)
+    function("loss", loss, "the parameters", "lambda x: x**2")
+    tolerance, reverse = known_number("tolerance", tolerance, positive=True), flag("reverse", reverse)
     point, tree = _flat(parameters)
+    horizon = None if motion is None else gradient_horizon(*several("motion", motion, _MOTION, 4))
     value = jnp.asarray(loss(tree(point)))
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(f"loss must give a real scalar, got {value.dtype} of shape {value.shape}: add it up")
@@ -155,7 +159,6 @@ def check_gradient(
     analytic = [forward, backward] if reverse else [forward]
     apart = max(float(np.max(np.abs(one - differences[:, 0]) * size)) / unit for one in analytic)
     noise = float(np.max(differences[:, 1] * size)) / own
-    horizon = None if motion is None else gradient_horizon(*motion)
     status = _verdict(apart, noise, tolerance, horizon, all(np.all(np.isfinite(one)) for one in analytic))
     return GradientCheck(
         value=value,
@@ -183,11 +186,13 @@ def _verdict(apart: float, noise: float, tolerance: float, horizon: GradientHori
 def _flat(parameters: Any) -> tuple[Any, Callable[[Any], Any]]:
     """The parameters as one vector, and the way back."""
     try:
-        leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(parameters)]
-    except (TypeError, ValueError, jax.errors.TracerArrayConversionError):
-        raise ValueError(f"parameters must be finite numbers, not traced by jit, got {parameters!r}") from None
+        leaves = [numbers("parameters", leaf) for leaf in jax.tree.leaves(parameters)]
+    except ValueError:
+        raise ValueError(
+            f"parameters must be finite numbers, not traced by jit, got {shown(parameters)}: give numbers"
+        ) from None
     if not sum(leaf.size for leaf in leaves) or not all(np.all(np.isfinite(leaf)) for leaf in leaves):
-        raise ValueError(f"parameters must be one finite number or more, got {parameters!r}")
+        raise ValueError(f"parameters must be one finite number or more, got {shown(parameters)}: give others")
     return ravel_pytree(jax.tree.unflatten(jax.tree.structure(parameters), [jnp.asarray(leaf) for leaf in leaves]))
 
 
@@ -222,7 +227,7 @@ _TIMES = 256
 
 
 def gradient_horizon(
-    pendulum: Pendulum, state: State, duration: Any, scheme: Scheme, *, tolerance: Any = 1e-3
+    pendulum: Pendulum | Any, state: State | Any, duration: Any, scheme: Scheme | Any, *, tolerance: Any = 1e-3
 ) -> GradientHorizon:
     """How long the derivatives of a motion with respect to its start and its pendulum are right to `tolerance`.
 
@@ -243,6 +248,8 @@ def gradient_horizon(
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
+    check_motion(pendulum, state)
+    check_scheme(scheme)
     known = known_number("duration", duration, unit="s")
     tolerance = known_number("tolerance", tolerance, positive=True)
     if not scheme.even:

@@ -33,6 +33,9 @@ WIDTH = 64
 # Blocks a device takes in one launch: enough that the millisecond of starting one is lost, also for short motions;
 # where each lane gives more than so many numbers, fewer.
 _BLOCKS, _FEW_NUMBERS = 256, 64
+# Steps that a device takes in one launch, at most, where a motion's are known: some five seconds at order 8. Results
+# come, and an interruption is heard, between launches.
+_LAUNCH_STEPS = 50_000_000
 # Launches under way at once: one runs, one waits, so that no device stands still while results are collected.
 _UNDER_WAY = 2
 
@@ -52,8 +55,8 @@ def over_lanes(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> A
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *pieces)
 
 
-def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> Iterator[Any]:
-    """The results of `over_lanes` piece by piece, as they come."""
+def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any, steps: float = 1.0) -> Iterator[Any]:
+    """The results of `over_lanes` piece by piece, as they come: smaller pieces where a lane takes many `steps`."""
     leaves, structure = jax.tree.flatten(each)
     table = np.stack([np.asarray(leaf, np.float64) for leaf in leaves])
     shared = jax.tree.map(partial(jnp.asarray, dtype=jnp.float64), shared)
@@ -64,7 +67,8 @@ def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> Ite
         return
     mesh = Mesh(np.array(devices), ("devices",))
     blocks = max(1, _BLOCKS * _FEW_NUMBERS // max(_FEW_NUMBERS, _rows(kinds)))
-    size = len(devices) * blocks * WIDTH
+    at_once = max(1, min(blocks, int(_LAUNCH_STEPS / (WIDTH * max(steps, 1.0)))))
+    size = len(devices) * at_once * WIDTH
     under_way: deque[tuple[jax.Array, int]] = deque()
     for start in range(0, table.shape[1], size):
         piece = table[:, start : start + size]

@@ -10,12 +10,16 @@ for any l2/l1 and g/l1 at all, or do they only when read in the other unit?
 """
 
 import csv
+import io
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from dpend.checks import file_path, numbers
+from dpend.files import parse_decimal, read_text
 
 
 class Angles(NamedTuple):
@@ -51,10 +55,7 @@ def checked(times: Any, theta1: Any, theta2: Any) -> Angles:
 
 
 def _column(name: str, column: Any, unit: str, gaps: bool = False) -> np.ndarray:
-    try:
-        array = np.asarray(column, float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be numbers [{unit}], got {column!r:.60}: give an array of numbers") from None
+    array = numbers(name, column, unit=unit, gaps=gaps)
     if array.ndim != 1:
         raise ValueError(f"{name} must have one dimension, got shape {array.shape}: give one number for each time")
     wrong = np.isinf(array) if gaps else ~np.isfinite(array)
@@ -65,24 +66,27 @@ def _column(name: str, column: Any, unit: str, gaps: bool = False) -> np.ndarray
     return array
 
 
-def load_angles(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+def load_angles(path: str | Path | Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Times [s] and both angles [rad] of a CSV file with columns time_s, theta1_deg, theta2_deg, in any order.
 
     One of the angles may be absent (None is returned for it), and cells of both may be empty (NaN). Other columns are
     not looked at, so that what `dpend simulate --out F.csv` writes is read as well.
 
     Raises:
-        ValueError: a file that cannot be read, a missing column, a cell that is no finite number, times that do not
-            increase, fewer than 7 angles of a rod, angles that look like radians; with the row, counted from the
-            header, which is row 1.
+        ValueError: a file that cannot be read, a missing or repeated column, a cell that is no finite number, times
+            that do not increase, fewer than 7 angles of a rod, angles that look like radians; with the row, counted
+            from the header, which is row 1.
     """
-    path = Path(path)
+    path = file_path("path", path)
     rows, lines = _rows(path)
     header = [name.strip() for name in rows[0]]
     present = [name for name in _COLUMNS if f"{name}_deg" in header]
     missing = "time_s" if "time_s" not in header else "" if present else "theta1_deg or theta2_deg"
     if missing:
         raise ValueError(f"{path} must have a column {missing}, got {', '.join(header)}: rename or convert a column")
+    for name in ("time_s", *(f"{name}_deg" for name in present)):
+        if header.count(name) > 1:
+            raise ValueError(f"{path} must have one column {name}, got {header.count(name)}: keep one of them")
     for row, line in zip(rows, lines, strict=True):
         if len(row) != len(header):
             raise ValueError(f"row {line} of {path} must have {len(header)} cells, got {len(row)}: mend the row")
@@ -107,10 +111,9 @@ def load_angles(path: str | Path) -> tuple[np.ndarray, np.ndarray | None, np.nda
 def _rows(path: Path) -> tuple[list[list[str]], list[int]]:
     """The rows of a CSV file that are not blank, and their numbers."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, strict=True)
-            found = [(row, reader.line_num) for row in reader if any(cell.strip() for cell in row)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
+        found = [(row, reader.line_num) for row in reader if any(cell.strip() for cell in row)]
+    except (OSError, ValueError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ValueError(
             f"data must be a CSV file that can be read, got {path} ({reason}): give another file"
@@ -126,7 +129,7 @@ def _cell(text: str, name: str, line: int, path: Path, gaps: bool) -> float:
     if gaps and not text:
         return math.nan
     try:
-        value = float(text)
+        value = parse_decimal(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
@@ -137,6 +140,8 @@ def _cell(text: str, name: str, line: int, path: Path, gaps: bool) -> float:
 
 # --- what cannot be --------------------------------------------------------------------------------------------------
 
+# An angle beyond this [rad] keeps less of its turn than a camera sees.
+_LARGEST = 1e6
 # Turns from sample to sample [rad], in the median: beyond this nobody can tell which way a rod went.
 _LARGEST_TURN = 1.0
 # The share of its own size, in squares, that the equation of motion is missed by: above the first it may be the wrong
@@ -159,6 +164,11 @@ def _check(series: Angles, there: list[bool], where: Callable[[str, int], str], 
         count = int(np.sum(np.isfinite(column)))
         if given and count < FEWEST:
             raise ValueError(f"{name} must be measured at least {FEWEST} times, got {count}: leave it out")
+        far = np.abs(column) > _LARGEST
+        if np.any(far):
+            i = int(np.argmax(far))
+            raise ValueError(f"{where(name, i)} must be within {_LARGEST:g} rad of zero, got {column[i]:g} rad: "
+                             "take off full turns, or the sample out")  # fmt: skip
         turns = np.abs(wrapped(np.diff(column[np.isfinite(column)])))
         if given and np.median(turns) > _LARGEST_TURN:
             i = int(np.flatnonzero(np.isfinite(column))[1 + int(np.argmax(turns > _LARGEST_TURN))])
@@ -196,6 +206,8 @@ def _disobedience(series: Angles, factor: float) -> float:
     delta = one.value - two.value
     rest = np.cos(delta) * one.bend - np.sin(delta) * one.slope**2
     columns = np.stack([two.bend, np.sin(two.value)], axis=1)
+    if not np.all(np.isfinite(np.append(columns, rest[:, None], axis=1))):
+        return 0.0  # samples so near to each other that second derivatives overflow tell nothing of the unit
     left = rest + columns @ np.linalg.lstsq(columns, -rest)[0]
     return float(np.sum(left**2) / max(np.sum(rest**2), 1e-300))
 
@@ -234,14 +246,23 @@ def local_cubics(times: np.ndarray, values: np.ndarray, at: np.ndarray, half: in
     weight = (1 - np.abs(scaled) ** 3) ** 3
     powers = scaled[..., None] ** np.arange(4)
     weighted = np.swapaxes(weight[..., None] * powers, 1, 2)
-    rows = np.linalg.solve(weighted @ powers, weighted)
+    try:
+        rows = np.linalg.solve(weighted @ powers, weighted)
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            f"times must be spaced evenly enough for cubics through {count} neighbours, got gaps "
+            f"from {np.min(np.diff(times)):.3g} s to {np.max(np.diff(times)):.3g} s: drop samples too near to others"
+        ) from None
     c = (rows @ values[index][..., None])[..., 0]
     nearest = np.min(np.abs(offset), axis=1)
     return Smooth(c[:, 0], c[:, 1] / reach, 2 * c[:, 2] / reach**2, rows[:, 0], index, nearest)
 
 
 def best_width(times: np.ndarray, values: np.ndarray) -> tuple[int, float]:
-    """The half width at which leaving out a sample predicts it best, and the noise that the cubics leave [rad]."""
+    """The half width at which leaving out a sample predicts it best, and the noise that the cubics leave [rad].
+
+    The noise is 0 where the cubics pass through all samples.
+    """
     best = (math.inf, _HALF_WIDTHS[0], math.nan)
     for half in _HALF_WIDTHS:
         if half > _HALF_WIDTHS[0] and 2 * half + 1 > times.size:
@@ -251,7 +272,8 @@ def best_width(times: np.ndarray, values: np.ndarray) -> tuple[int, float]:
         left = values - smooth.value
         missed = float(np.mean((left / np.maximum(1 - own, 1e-3)) ** 2))
         freedom = float(np.sum(1 - 2 * own + np.sum(smooth.rows**2, axis=1)))
-        best = min(best, (missed, half, math.sqrt(float(np.sum(left**2)) / freedom)))
+        noise = math.sqrt(float(np.sum(left**2)) / freedom) if freedom > 0 else 0.0
+        best = min(best, (missed, half, noise))
         if missed > 2 * best[0]:
             break  # wider ones cut off more and more of the motion
     return best[1], best[2]

@@ -20,16 +20,26 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from dpend._runtime import require_float64
-from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, normal_modes, number, released, vector_field
+from dpend.checks import at_most_one, flag, integer, is_traced, known_value, number, one_of, several, single
+from dpend.pendulum import (
+    Pendulum,
+    Scalar,
+    State,
+    check_pendulum,
+    hamiltonian,
+    known_pendulum,
+    normal_modes,
+    released,
+    vector_field,
+)
 from dpend.shooting import PARTS, Walk, arc_of, arc_times, beginning, fastest, hermite, natural, stride
 from dpend.stability import stability_class, stability_of, transition
 from dpend.steppers import Scheme
-from dpend.trajectory import Status, known_value, march, moved, step_size
+from dpend.trajectory import Status, march, moved, step_size
 
 BRANCHES = ("in-phase", "anti-phase")
 SYMMETRIES = ("centred", "brake")
@@ -37,6 +47,12 @@ SYMMETRIES = ("centred", "brake")
 _RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
 # No number is better known than this, relative to itself.
 _LAST_BIT = sys.float_info.epsilon
+# How many units in the last place of its coordinates, times sqrt(1 + m2/m1), the rounding of a step amounts to.
+# Measured against long double (experiments/orbit_errors.py), which shows the quantiles of estimate over error.
+_ROUNDINGS = 2.0
+# A state on the way whose rounding was a displacement of the start by more than so many units in the last place no
+# longer matters to where the root is, and its square would drown what does.
+_FORGOTTEN = 1e5
 # rate times step [rad]: leaves errors of rounding in theta2 and T.
 _FINE = 0.1
 # A number of steps at which a motion cannot be what was meant: the search is lost.
@@ -62,8 +78,9 @@ class PeriodicOrbit:
         log_abs_kappa: log |kappa|, natural.
         dual: the state at T/2, the other rest of the orbit.
         turns: theta(T/4)/pi of a centred orbit, two integers; zeros otherwise.
-        error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s]: the change on solving again at half
-            the step; NaN if that was not asked for.
+        error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s], theta1 taken as it is: the change
+            on solving again at half the step, and what the rounding of the motion makes of them; NaN if that was not
+            asked for.
         status: a value of `Status`.
         symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from rest), or `odd`
             (x(T/2) = -x(0) up to full turns, never at rest; found by `follow_family`).
@@ -110,13 +127,19 @@ class _Line(NamedTuple):
 
 
 class _Shot(NamedTuple):
-    """The equations at one point: their value, and the Jacobian in (theta1, theta2, log of the shooting time)."""
+    """The equations at one point: their value, and the Jacobian in (theta1, theta2, log of the shooting time).
+
+    `by_start` is the derivative of the value with respect to the whole first state, momenta included; `rounding` is the
+    covariance of that state which does to the end what a unit in the last place of every state on the way does.
+    """
 
     value: Float[Array, "2"]
     jacobian: Float[Array, "2 3"]
+    by_start: Float[Array, "2 4"]
     matrix: Float[Array, "4 4"]
     end: State
     rate: Scalar
+    rounding: Float[Array, "4 4"]
 
 
 def _clock(pendulum: Pendulum) -> Scalar:
@@ -145,21 +168,31 @@ def _shoot(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, s
 
     def step(carry: Any, time: Scalar, dt: Scalar) -> Any:
         state, tangents = _RK8.advance_tangents(pendulum, carry[0], carry[1], dt)
-        return state, tangents, jnp.fmax(carry[2], fastest(pendulum, state))
+        back = _inverse(tangents) * (_LAST_BIT * jnp.stack(jax.tree.leaves(state)))
+        back = jnp.where(jnp.max(jnp.abs(back[:2])) < _FORGOTTEN * _LAST_BIT, back, 0.0)
+        rounding = carry[3] + jnp.sum(back[:, None, :] * back[None, :, :], axis=2)  # fuses, and a product does not
+        return state, tangents, jnp.fmax(carry[2], fastest(pendulum, state)), rounding
 
-    start = (state, State(*jnp.eye(4)), fastest(pendulum, state))
-    end, tangents, rate = march(step, start, step_size(time, steps), steps)
+    start = (state, State(*jnp.eye(4)), fastest(pendulum, state), jnp.zeros((4, 4)))
+    end, tangents, rate, rounding = march(step, start, step_size(time, steps), steps)
     matrix = jnp.stack(jax.tree.leaves(tangents))
     slope = vector_field(pendulum, end)
     if symmetry == "centred":
         value = jnp.stack([end.theta1, end.theta2]) - jnp.pi * turns
-        jacobian = jnp.column_stack([matrix[:2, :2], time * jnp.stack([slope.theta1, slope.theta2])])
+        by_start, by_time = matrix[:2], time * jnp.stack([slope.theta1, slope.theta2])
     else:
         unit = _momentum_unit(pendulum) * time * _clock(pendulum)
         value = jnp.stack([end.p1, end.p2]) / unit
-        jacobian = jnp.column_stack([matrix[2:, :2], time * jnp.stack([slope.p1, slope.p2])]) / unit
-        jacobian = jacobian.at[:, 2].add(-value)
-    return _Shot(value, jacobian, matrix, end, rate)
+        by_start, by_time = matrix[2:] / unit, time * jnp.stack([slope.p1, slope.p2]) / unit - value
+    jacobian = jnp.column_stack([by_start[:, :2], by_time])
+    return _Shot(value, jacobian, by_start, matrix, end, rate, rounding)
+
+
+def _inverse(tangents: State) -> Float[Array, "4 4"]:
+    """The inverse of a symplectic matrix, of which these are the rows."""
+    a, b = jnp.stack([tangents.theta1, tangents.theta2]), jnp.stack([tangents.p1, tangents.p2])
+    above = jnp.concatenate([b[:, 2:].T, -a[:, 2:].T], axis=1)
+    return jnp.concatenate([above, jnp.concatenate([-b[:, :2].T, a[:, :2].T], axis=1)])
 
 
 # --- Newton's method on a line ---------------------------------------------------------------------------------------
@@ -182,6 +215,28 @@ class _Newton(NamedTuple):
     status: Scalar
 
 
+def _newton_update(line: _Line, jacobian: Array, value: Array) -> Array:
+    """The change of (x, log of the shooting time) that the linear equations ask for; `value` may have columns."""
+    square = jnp.column_stack([jacobian[:, :2] @ line.direction, jacobian[:, 2]])
+    determinant = square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0]
+    adjugate = jnp.array([[square[1, 1], -square[0, 1]], [-square[1, 0], square[0, 0]]])
+    return -(adjugate @ value) / determinant
+
+
+def _rounding(pendulum: Pendulum, line: _Line, shot: _Shot) -> Float[Array, "2"]:
+    """What rounding on the way makes of (x, log of the shooting time).
+
+    Each step's is independent of the others' and grows as the motion does from there; the root takes their sum as it
+    takes any change of the equations.
+    """
+    by_start = _newton_update(line, shot.jacobian, shot.by_start)
+    return (
+        _ROUNDINGS
+        * jnp.sqrt(1 + pendulum.m2 / pendulum.m1)
+        * jnp.sqrt(jnp.maximum(jnp.diagonal(by_start @ shot.rounding @ by_start.T), 0.0))
+    )
+
+
 def _newton(
     pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, steps: Scalar, turns: Array, symmetry: str,
     tolerance: Scalar, max_iterations: Scalar,
@@ -196,11 +251,7 @@ def _newton(
     def shoot(x: Scalar, log_time: Scalar) -> _Shot:
         return _shoot(pendulum, line.base + x * line.direction, log_time, steps, symmetry, turns)
 
-    def newton_update(jacobian: Array, value: Array) -> Array:
-        square = jnp.column_stack([jacobian[:, :2] @ line.direction, jacobian[:, 2]])
-        determinant = square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0]
-        adjugate = jnp.array([[square[1, 1], -square[0, 1]], [-square[1, 0], square[0, 0]]])
-        return -(adjugate @ value) / determinant
+    newton_update = partial(_newton_update, line)
 
     def iterate(s: _Newton) -> _Newton:
         trial = jnp.stack([s.x, s.log_time]) + s.damping * s.update
@@ -234,7 +285,7 @@ def _newton(
         )
 
     nan = jnp.asarray(jnp.nan)
-    blank = _Shot(jnp.full(2, nan), jnp.full((2, 3), nan), jnp.full((4, 4), nan), State(nan, nan, nan, nan), nan)
+    blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, nan), jax.eval_shape(shoot, x, log_time))
     start = _Newton(
         x, log_time, jnp.asarray(jnp.inf), blank, jnp.zeros(2), jnp.asarray(1.0), jnp.asarray(0), jnp.asarray(_RUNNING)
     )
@@ -442,7 +493,7 @@ def _solved(
         x, log_time = both.x[1] + both.update[1, 0], both.log_time[1] + both.update[1, 1]
         period = PARTS[symmetry] * jnp.exp(newton.log_time)
         change = jnp.stack([jnp.abs(x - newton.x), period * jnp.abs(jnp.expm1(log_time - newton.log_time))])
-        change = jnp.maximum(change, _LAST_BIT * jnp.stack([jnp.abs(newton.x), period]))
+        change = change + _rounding(pendulum, line, newton.shot) * jnp.stack([1.0, period])
         change = jnp.where(both.status[1] == Status.CONVERGED, change, jnp.nan)
     return newton, steps, change
 
@@ -567,11 +618,12 @@ _LEFT = 0.1
 
 # --- from a guess ----------------------------------------------------------------------------------------------------
 
-# A guess may be any multiple of the minimal period up to this one.
-_LARGEST_COVER = 16
-# How far from rest [units m2 l2 sqrt(g l2)], or from the centre [rad], a shorter orbit may be, the root having 1e-12;
-# and how near to an equilibrium a search may end; both in units of the swing.
+# How fast either rod may turn where the motion rests, in units of its fastest before: the root has 1e-12, and grows by
+# no more than the root of 1e16 up to the first of several rests. And how near to an equilibrium a search may end, in
+# units of the swing.
 _SAME = 1e-6
+# Secants for the place of a rest within a step of 0.1 rad: it is then known to 1e-12 of the step.
+_TRIES = 5
 
 
 @partial(jax.jit, static_argnames=("symmetry", "error"))
@@ -582,18 +634,24 @@ def _near_guess(pendulum, line, x, log_time, symmetry, error, turn, tolerance, m
     for _ in range(2):  # the rate decides the steps, and the steps what rate is seen
         rate, end = _rate_along(fixed, still, x, log_time, _steps_for(log_time, rate, turn))
     turns = jnp.round(end / jnp.pi) if symmetry == "centred" else jnp.zeros(2)
-    steps = _steps_for(log_time, rate, turn)
-    first = _newton(fixed, still, x, log_time, steps, turns, symmetry, tolerance, max_iterations)
+    too_long = jnp.exp(log_time) * rate > turn * _MOST_STEPS
+    steps = jnp.where(too_long, 8, _steps_for(log_time, rate, turn))
+    most = jnp.where(too_long, 1, max_iterations)
+    first = _newton(fixed, still, x, log_time, steps, turns, symmetry, tolerance, most)
     angles = still.base + first.x * still.direction
-    cover, turns = _cover(fixed, angles, first.log_time, steps, turns, symmetry)
-    log_time = first.log_time - jnp.log(cover)
-    settings = _Settings(turn, tolerance, jnp.maximum(max_iterations - first.iterations, 1), error)
+    log_time, turns = _minimal(fixed, angles, first.log_time, steps, turns, symmetry)
+    reduced = log_time < first.log_time
+    settings = _Settings(turn, tolerance, jnp.maximum(most - first.iterations, 1), error)
     newton, steps, change = _solved(fixed, still, first.x, log_time, first.shot.rate, turns, symmetry, settings)
     at_equilibrium = _swing(angles) < _SAME * jnp.minimum(1.0, _swing(still.base + x * still.direction))
-    status = jnp.where(first.status == Status.CONVERGED, newton.status, first.status)
+    # Many periods of an unstable orbit are too long for Newton's method, and one is not.
+    status = jnp.where((first.status == Status.CONVERGED) | reduced, newton.status, first.status)
+    status = jnp.where(too_long, Status.BEYOND_HORIZON, status)
     status = jnp.where(at_equilibrium, Status.TRIVIAL_ROOT, status)
     newton = newton._replace(iterations=first.iterations + newton.iterations)
-    return _orbit(pendulum, line, newton, steps, change, turns, symmetry, status)
+    orbit = _orbit(pendulum, line, newton, steps, change, turns, symmetry, status)
+    unknown = jnp.where(too_long, jnp.nan, 0.0)
+    return replace(orbit, kappa=orbit.kappa + unknown, log_abs_kappa=orbit.log_abs_kappa + unknown)
 
 
 def _swing(angles: Array) -> Scalar:
@@ -614,45 +672,103 @@ def _rate_along(pendulum: Pendulum, line: _Line, x: Scalar, log_time: Scalar, st
     return rate, jnp.stack([end.theta1, end.theta2])
 
 
-def _cover(
+class _Pass(NamedTuple):
+    """Where a search for a rest stands: a step that began at `state` and is tried up to `ahead` [s] from there."""
+
+    state: State
+    slope: Scalar  # of the kinetic energy, at `state`
+    time: Scalar
+    ahead: Scalar
+    tries: Scalar  # of the step's lowest point; 0 while nothing is seen
+    before: tuple[Scalar, Scalar]  # the last try: how far ahead, and the slope there
+    next: tuple[State, Scalar]  # the step's end, and the slope there
+    fastest: Float[Array, "2"]  # the largest rates so far
+    end: State
+    found: Scalar
+
+
+def _first_rest(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar) -> tuple[Scalar, State, Scalar]:
+    """The time of the first rest after the release, the state there, and whether there is one before exp(log_time).
+
+    At a rest the kinetic energy has a minimum, whose place is where its slope vanishes: found by secants from the step
+    in which the slope turns positive. All steps and tries are turns of one loop, each an integration step.
+    """
+    duration = jnp.exp(log_time)
+    dt = step_size(duration, steps)
+
+    def kinetic_slope(state: State) -> Scalar:
+        rates, still = vector_field(pendulum, state), released(state.theta1, state.theta2)
+        force = vector_field(pendulum, still)  # minus the slope of the potential energy
+        return rates.theta1 * force.p1 + rates.theta2 * force.p2
+
+    def rates_of(state: State) -> Array:
+        rates = vector_field(pendulum, state)
+        return jnp.abs(jnp.stack([rates.theta1, rates.theta2]))
+
+    def turn(s: _Pass) -> _Pass:
+        here = _RK8.advance(pendulum, s.state, s.ahead)
+        slope = kinetic_slope(here)
+        seen = (s.tries == 0) & (s.slope < 0) & (slope >= 0)
+        trying = s.tries > 0
+        over = s.tries == _TRIES
+        rest = over & jnp.all(rates_of(here) < _SAME * s.fastest)
+        onto_next = (~trying & ~seen) | (over & ~rest)
+        after, after_slope = jax.tree.map(partial(jnp.where, trying), s.next, (here, slope))
+        last_ahead, last_slope = jax.tree.map(partial(jnp.where, trying), s.before, (jnp.zeros(()), s.slope))
+        secant = s.ahead - slope * (s.ahead - last_ahead) / (slope - last_slope)
+        secant = jnp.where(jnp.isfinite(secant), jnp.clip(secant, 0.0, dt), s.ahead)
+        keep = partial(jnp.where, onto_next)
+        return _Pass(
+            state=jax.tree.map(keep, after, s.state),
+            slope=keep(after_slope, s.slope),
+            time=s.time + jnp.where(onto_next, dt, jnp.where(rest, s.ahead, 0.0)),
+            ahead=keep(dt, jnp.where(rest, s.ahead, secant)),
+            tries=keep(0, s.tries + 1),
+            before=(s.ahead, slope),
+            next=(after, after_slope),
+            fastest=jnp.fmax(s.fastest, jnp.where(onto_next, rates_of(after), 0.0)),
+            end=here,
+            found=rest,
+        )
+
+    state, zero = released(*angles), jnp.zeros(())
+    none = (zero, zero), (state, zero), jnp.zeros(2), state, jnp.asarray(False)
+    start = _Pass(state, zero, zero, dt, jnp.asarray(0), *none)
+    s = lax.while_loop(lambda s: ~s.found & (s.time < duration - 0.5 * dt), turn, start)
+    return s.time, s.end, s.found
+
+
+def _minimal(
     pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, turns: Array, symmetry: str
 ) -> tuple[Scalar, Array]:
-    """How many times the minimal period a root's period is, and the turns at a quarter of the minimal one.
+    """The log of the shooting time that belongs to a root's minimal period, and the turns at its quarter.
 
-    A brake orbit traversed k times is at rest after a k-th of its half period; a centred one only an odd multiple.
+    The first rest after the release is the orbit's other one, half the minimal period later.
     """
-    k = jnp.arange(2 if symmetry == "brake" else 3, _LARGEST_COVER + 1, 1 if symmetry == "brake" else 2)
-    state = released(*angles)
-    dts = step_size(jnp.exp(log_time), k * steps)
-    ends = jax.vmap(lambda dt: moved(_RK8, pendulum, state, dt, steps))(dts)
-    reached = jnp.round(jnp.stack([ends.theta1, ends.theta2]) / jnp.pi)
+    time, rest, found = _first_rest(pendulum, angles, log_time, steps)
     if symmetry == "centred":
-        missed = jnp.abs(jnp.stack([ends.theta1, ends.theta2]) - jnp.pi * reached)
-    else:
-        missed = jnp.abs(jnp.stack([ends.p1, ends.p2])) / _momentum_unit(pendulum)
-    same = jnp.max(missed, axis=0) < _SAME * jnp.minimum(1.0, _swing(angles))
-    last = k.size - 1 - jnp.argmax(same[::-1])
-    covered = jnp.any(same)
-    turns = jnp.where(covered, reached[:, last], turns) if symmetry == "centred" else turns
-    return jnp.where(covered, k[last], 1).astype(jnp.float64), turns
+        time = 0.5 * time
+        turns = jnp.where(found, jnp.round((angles + jnp.stack([rest.theta1, rest.theta2])) / (2 * jnp.pi)), turns)
+    covers = jnp.round(jnp.exp(log_time) / jnp.where(found, time, 1.0))
+    return jnp.where(found & (covers > 1), jnp.log(jnp.where(found, time, 1.0)), log_time), turns
 
 
 # --- the friendly call -----------------------------------------------------------------------------------------------
 
 
 def find_orbit(
-    pendulum: Pendulum,
+    pendulum: Pendulum | Any,
     theta1: Scalar,
     *,
-    branch: str | None = None,
-    guess: tuple[Scalar, Scalar] | None = None,
-    symmetry: str | None = None,
-    ratio: int | None = None,
-    crossing: int = 1,
-    turn: float = _FINE,
-    tolerance: float = 1e-13,
-    max_iterations: int = 40,
-    error: bool = True,
+    branch: str | Any | None = None,
+    guess: tuple[Scalar, Scalar] | Any | None = None,
+    symmetry: str | Any | None = None,
+    ratio: int | Any | None = None,
+    crossing: int | Any = 1,
+    turn: float | Any = _FINE,
+    tolerance: float | Any = 1e-13,
+    max_iterations: int | Any = 40,
+    error: bool | Any = True,
 ) -> PeriodicOrbit:
     """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period.
 
@@ -693,19 +809,22 @@ def find_orbit(
         normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159: the quarter period.
     """
     require_float64()
-    theta1 = number("theta1", theta1, unit="rad")
+    theta1, crossing = number("theta1", theta1, unit="rad"), integer("crossing", crossing)
     _check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
     settings = {
-        "error": bool(error),
+        "error": flag("error", error),
         "turn": number("turn", turn, positive=True, unit="rad"),
         "tolerance": number("tolerance", tolerance, positive=True),
-        "max_iterations": max_iterations,
+        # This may be traced: it bounds a loop.
+        "max_iterations": max_iterations if is_traced(max_iterations) else integer("max_iterations", max_iterations),
     }
+    for name, value in settings.items():
+        single(name, value)
     theta1 = jnp.asarray(theta1, jnp.float64)
     if guess is None:
         slow = (branch or ("in-phase" if ratio == 1 else "anti-phase")) == "in-phase"
         return _on_branch(pendulum, theta1, slow, crossing, float(ratio or 0), **settings)
-    theta2, period = (jnp.asarray(number(n, v), jnp.float64) for n, v in zip(("theta2", "period"), guess, strict=True))
+    theta2, period = (jnp.asarray(value, jnp.float64) for value in _guessed(guess))
     if ratio is None:
         line, x = _Line(jnp.stack([theta1, 0.0]), jnp.array([0.0, 1.0])), theta2
     else:
@@ -725,26 +844,24 @@ def find_orbit(
 
 
 def _check_request(  # type: ignore[no-untyped-def]
-    pendulum: Pendulum, theta1: Scalar, branch, guess, symmetry, ratio, crossing
+    pendulum: Pendulum | Any, theta1: Scalar, branch, guess, symmetry, ratio, crossing
 ) -> None:
     """Refuses what cannot be asked, as far as the values are known before tracing."""
-    if branch is not None and branch not in BRANCHES:
-        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
-    if symmetry is not None and symmetry not in SYMMETRIES:
-        raise ValueError(f"symmetry must be one of {', '.join(SYMMETRIES)}, got {symmetry!r}")
-    if ratio not in (None, 1, -1):
-        raise ValueError(f"ratio must be 1 or -1, got {ratio!r}")
-    if branch is not None and guess is not None:
-        raise ValueError(f"branch and guess exclude each other, got {branch!r} and {guess}: give one of them")
+    check_pendulum(pendulum)
+    for name, value, words in (("branch", branch, BRANCHES), ("symmetry", symmetry, SYMMETRIES)):
+        if value is not None:
+            one_of(name, value, words)
+    if ratio is not None:
+        one_of("ratio", ratio, (1, -1))
+    at_most_one(branch=branch, guess=guess)
     if branch is None and guess is None and ratio is None:
         raise ValueError("branch must be given, or guess=(theta2, period), or ratio=1 or -1; got none of them")
     if symmetry is not None and guess is None:
         raise ValueError(f"symmetry goes with guess, got {symmetry!r} alone: orbits on a branch are centred")
-    if not isinstance(crossing, int) or crossing < 1 or (crossing > 1 and (branch is None or ratio is not None)):
-        raise ValueError(f"crossing must be an integer of at least 1, and goes with branch alone, got {crossing!r}")
+    if crossing > 1 and (branch is None or ratio is not None):
+        raise ValueError(f"crossing must be 1 but with branch alone, got {crossing}: leave it out")
     for name, value in {"theta1": theta1, **vars(pendulum)}.items():
-        if np.ndim(value):
-            raise ValueError(f"{name} must be a scalar, got shape {np.shape(value)}: map over many with jax.vmap")
+        single(name, value)
     gravity, angle1 = known_value(pendulum.g), known_value(theta1)
     if angle1 is not None and not math.isfinite(angle1):
         raise ValueError(f"theta1 must be a finite number [rad], got {angle1}: give another theta1")
@@ -757,7 +874,7 @@ def _check_request(  # type: ignore[no-untyped-def]
                 "the branches pass there only in equilibrium"
             )
         return
-    theta2, period = (known_value(number(name, value)) for name, value in zip(("theta2", "period"), guess, strict=True))
+    theta2, period = (known_value(value) for value in _guessed(guess))
     if period is not None and not period > 0:
         raise ValueError(f"period must be positive [s], got {period:g}: give another guess")
     if angle1 is not None and theta2 is not None and _multiple_of_pi(angle1) and _multiple_of_pi(theta2):
@@ -765,6 +882,26 @@ def _check_request(  # type: ignore[no-untyped-def]
             f"theta2 must not be a multiple of 180 degrees with theta1 at {math.degrees(angle1):g} degrees, "
             f"got {math.degrees(theta2):g} degrees: that is an equilibrium"
         )
+
+
+def _guessed(guess: Any) -> tuple[Scalar, Scalar]:
+    """theta2 [rad] and the period [s] of a guess, checked."""
+    theta2, period = several("guess", guess, "a pair (theta2, period)", 2)
+    for name, value in (("theta2", theta2), ("period", period)):
+        single(f"guess of {name}", value)
+    return number("guess of theta2", theta2, unit="rad"), number("guess of period", period, unit="s")
+
+
+def swinging_pendulum(pendulum: Any) -> Pendulum:
+    """A pendulum whose fields are plain numbers and that has orbits.
+
+    Raises:
+        ValueError: as `known_pendulum`; g not positive.
+    """
+    fixed = known_pendulum(pendulum)
+    if not fixed.g > 0:
+        raise ValueError(f"g must be positive for orbits, got {fixed.g:g}: nothing swings back without gravity")
+    return fixed
 
 
 def _multiple_of_pi(angle: float) -> bool:

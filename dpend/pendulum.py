@@ -6,54 +6,68 @@ delta = theta1 - theta2 and mu = m2/m1 the Hamiltonian is (Yamaguchi, section 2)
     H = [p1^2/(2 m1 l1^2) + p2^2 (1 + mu)/(2 m2 l2^2) - p1 p2 cos(delta)/(m1 l1 l2)] / (1 + mu sin^2 delta)
         - (m1 + m2) g l1 cos theta1 - m2 g l2 cos theta2.
 
-Every function takes leaves of any one shape, so grids of states and of pendulums need no `vmap`. SI units throughout.
+Every function takes leaves of any one shape, so grids of states and of pendulums need no `vmap`; what is no `Pendulum`
+or no `State` raises a ValueError. SI units throughout.
 """
 
-import math
-from dataclasses import dataclass, replace
-from numbers import Real
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dpend._runtime import require_float64
+from dpend.checks import coordinate, instance, known_number, known_value, number, one_shape, single
 from dpend.trig import sincos
 
 # A float64 scalar, or an array where a class holds many at once; transformations also pass tracers and placeholders.
 Scalar: TypeAlias = Any
 
 
-def number(name: str, value: Scalar, *, positive: bool = False, unit: str = "") -> Scalar:
-    """A Python number as float64, checked; anything else (arrays, tracers, placeholders) as it came.
+Tree = TypeVar("Tree")
 
-    Raises:
-        ValueError: text, NaN, an infinity, or with `positive` a number that is not above zero.
+
+def _register(cls: type[Tree]) -> type[Tree]:
+    """Make a dataclass whose constructor checks its numbers a JAX tree of its fields.
+
+    Libraries rebuild trees from leaves that are no numbers: masks, `None`, text, shapes, differences of lengths. So
+    unflattening fills the fields and never runs a check: any leaf passes. `register_dataclass` calls the constructor.
     """
-    wanted = f"a finite {'positive ' if positive else ''}number" + (f" [{unit}]" if unit else "")
-    if isinstance(value, (str, bytes)):
-        raise ValueError(f"{name} must be {wanted}, got {value!r}: give a number")
-    if not isinstance(value, Real) or isinstance(value, bool):  # libraries fill trees with booleans as masks
-        return value
-    if not math.isfinite(value) or (positive and value <= 0):
-        raise ValueError(f"{name} must be {wanted}, got {value}: give another {name}")
-    return np.float64(value)
+    names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+    keys = [jax.tree_util.GetAttrKey(name) for name in names]
+
+    def flatten(tree: Tree) -> tuple[list[Any], None]:
+        return [getattr(tree, name) for name in names], None
+
+    def flatten_with_keys(tree: Tree) -> tuple[list[tuple[Any, Any]], None]:
+        return list(zip(keys, flatten(tree)[0], strict=True)), None
+
+    def unflatten(_: None, leaves: Iterable[Any]) -> Tree:
+        tree = object.__new__(cls)
+        for name, leaf in zip(names, leaves, strict=True):
+            object.__setattr__(tree, name, leaf)
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
 
 
-@jax.tree_util.register_dataclass
+@_register
 @dataclass(frozen=True)
 class Pendulum:
     """The parameters of a double pendulum; bob 1 hangs from the pivot, bob 2 from bob 1.
 
-    The defaults are those of Yamaguchi's paper. Python numbers become float64 and are checked.
+    The defaults are those of Yamaguchi's paper. Whoever constructs one has its numbers checked and made float64, of
+    arrays the sign; tracers pass, and so does everything that libraries put into the tree by unflattening.
 
     Attributes:
         l1, l2: lengths of the rods [m], positive.
         m1, m2: masses of the bobs [kg], positive.
         g: acceleration of gravity [m/s^2], downwards; any finite number, but orbits and modes need g > 0.
     Raises:
-        ValueError: a parameter is not finite, or a length or mass not positive.
+        ValueError: a parameter is no finite number, or a length or mass not positive; arrays that do not broadcast.
         RuntimeError: float64 is switched off in JAX.
     """
 
@@ -68,9 +82,10 @@ class Pendulum:
         for name, unit in (("l1", "m"), ("l2", "m"), ("m1", "kg"), ("m2", "kg")):
             object.__setattr__(self, name, number(name, getattr(self, name), positive=True, unit=unit))
         object.__setattr__(self, "g", number("g", self.g, unit="m/s^2"))
+        one_shape(**vars(self))
 
 
-@jax.tree_util.register_dataclass
+@_register
 @dataclass(frozen=True)
 class State:
     """A point of phase space, or many of one shape.
@@ -79,7 +94,8 @@ class State:
         theta1, theta2: absolute angles from the downward vertical [rad], never wrapped.
         p1, p2: canonical momenta [kg m^2/s].
     Raises:
-        ValueError: a Python number that is not finite.
+        ValueError: a coordinate is no finite number; arrays that do not broadcast. An array, also a single number that
+            JAX has computed, may hold NaN: a motion that was lost.
     """
 
     theta1: Scalar
@@ -89,7 +105,57 @@ class State:
 
     def __post_init__(self) -> None:
         for name, unit in (("theta1", "rad"), ("theta2", "rad"), ("p1", "kg m^2/s"), ("p2", "kg m^2/s")):
-            object.__setattr__(self, name, number(name, getattr(self, name), unit=unit))
+            object.__setattr__(self, name, coordinate(name, getattr(self, name), unit=unit))
+        one_shape(**vars(self))
+
+
+def check_pendulum(pendulum: Any) -> None:
+    """Refuses what is no `Pendulum`.
+
+    Raises:
+        ValueError: another class.
+    """
+    instance("pendulum", pendulum, Pendulum, "dpend.Pendulum(l1=...)")
+
+
+def check_state(state: Any, name: str = "state") -> None:
+    """Refuses what is no `State`.
+
+    Raises:
+        ValueError: another class.
+    """
+    instance(name, state, State, "dpend.released(theta1, theta2) or dpend.State(theta1, theta2, p1, p2)")
+
+
+def check_mechanics(pendulum: Any, state: Any) -> None:
+    """Refuses what are no pendulum and no state, of any shape.
+
+    Raises:
+        ValueError: another class.
+    """
+    check_pendulum(pendulum)
+    check_state(state)
+
+
+def check_motion(pendulum: Any, state: Any) -> None:
+    """Refuses what are not one pendulum and one state; `jax.vmap` maps over many.
+
+    Raises:
+        ValueError: another class, or a leaf that is an array.
+    """
+    check_mechanics(pendulum, state)
+    for name, leaf in (*vars(pendulum).items(), *vars(state).items()):
+        single(name, leaf)
+
+
+def known_pendulum(pendulum: Any) -> Pendulum:
+    """A pendulum whose fields are plain numbers, for what no derivative goes through.
+
+    Raises:
+        ValueError: another class; a field that is an array, or traced by `jit` or a derivative.
+    """
+    check_pendulum(pendulum)
+    return Pendulum(**{name: known_number(name, leaf) for name, leaf in vars(pendulum).items()})
 
 
 class BobEnergies(NamedTuple):
@@ -147,9 +213,9 @@ def released(theta1: Scalar, theta2: Scalar) -> State:
     """The state at rest with these angles [rad].
 
     Raises:
-        ValueError: a Python number that is not finite.
+        ValueError: an angle is no finite number, as for `State`.
     """
-    theta1, theta2 = number("theta1", theta1, unit="rad"), number("theta2", theta2, unit="rad")
+    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
     at_rest = jnp.zeros(jnp.broadcast_shapes(jnp.shape(theta1), jnp.shape(theta2)))
     return State(theta1, theta2, at_rest, at_rest)
 
@@ -173,8 +239,9 @@ def _rates(pendulum: Pendulum, state: State, sin_delta: Scalar, cos_delta: Scala
     return omega1, omega2
 
 
-def hamiltonian(pendulum: Pendulum, state: State) -> Scalar:
+def hamiltonian(pendulum: Pendulum | Any, state: State | Any) -> Scalar:
     """The energy H [J], zero for both bobs at rest at the pivot's height."""
+    check_mechanics(pendulum, state)
     _, _, sin_delta, cos_delta = _relative_angle(state)
     omega1, omega2 = _rates(pendulum, state, sin_delta, cos_delta)
     _, cos1 = sincos(state.theta1)
@@ -184,7 +251,7 @@ def hamiltonian(pendulum: Pendulum, state: State) -> Scalar:
     return 0.5 * (state.p1 * omega1 + state.p2 * omega2) - weight1 * cos1 - weight2 * cos2
 
 
-def vector_field(pendulum: Pendulum, state: State) -> State:
+def vector_field(pendulum: Pendulum | Any, state: State | Any) -> State:
     """The time derivative of the state, Hamilton's equations of `hamiltonian`.
 
     The force between the bobs is written with the velocities, m2 l1 l2 omega1 omega2 sin(delta), which is what the
@@ -193,6 +260,7 @@ def vector_field(pendulum: Pendulum, state: State) -> State:
     Returns:
         State whose leaves are theta1' , theta2' [rad/s], p1', p2' [N m].
     """
+    check_mechanics(pendulum, state)
     sin1, sin2, sin_delta, cos_delta = _relative_angle(state)
     omega1, omega2 = _rates(pendulum, state, sin_delta, cos_delta)
     pull = (pendulum.m2 * pendulum.l1 * pendulum.l2) * (omega1 * omega2) * sin_delta
@@ -201,20 +269,22 @@ def vector_field(pendulum: Pendulum, state: State) -> State:
     return State(omega1, omega2, -pull - torque1, pull - torque2)
 
 
-def velocities(pendulum: Pendulum, state: State) -> tuple[Scalar, Scalar]:
+def velocities(pendulum: Pendulum | Any, state: State | Any) -> tuple[Scalar, Scalar]:
     """The angular velocities theta1', theta2' [rad/s] that belong to the momenta."""
+    check_mechanics(pendulum, state)
     _, _, sin_delta, cos_delta = _relative_angle(state)
     return _rates(pendulum, state, sin_delta, cos_delta)
 
 
-def momenta(pendulum: Pendulum, theta1: Scalar, theta2: Scalar, omega1: Scalar, omega2: Scalar) -> State:
+def momenta(pendulum: Pendulum | Any, theta1: Scalar, theta2: Scalar, omega1: Scalar, omega2: Scalar) -> State:
     """The state with these angles [rad] and angular velocities [rad/s]: p = M(delta) omega.
 
     Raises:
-        ValueError: a Python number that is not finite.
+        ValueError: an angle or a velocity is no finite number, as for `State`.
     """
-    theta1, theta2 = number("theta1", theta1, unit="rad"), number("theta2", theta2, unit="rad")
-    omega1, omega2 = number("omega1", omega1, unit="rad/s"), number("omega2", omega2, unit="rad/s")
+    check_pendulum(pendulum)
+    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
+    omega1, omega2 = coordinate("omega1", omega1, unit="rad/s"), coordinate("omega2", omega2, unit="rad/s")
     _, cos_delta = sincos(theta1 - theta2)
     coupling = pendulum.m2 * pendulum.l1 * pendulum.l2 * cos_delta
     p1 = (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * omega1 + coupling * omega2
@@ -222,11 +292,12 @@ def momenta(pendulum: Pendulum, theta1: Scalar, theta2: Scalar, omega1: Scalar, 
     return State(theta1, theta2, p1, p2)
 
 
-def energies(pendulum: Pendulum, state: State) -> BobEnergies:
+def energies(pendulum: Pendulum | Any, state: State | Any) -> BobEnergies:
     """Kinetic and potential energy of each bob [J], the latter zero where that bob hangs at rest.
 
     Their sum is H - H(hanging at rest). 1 - cos theta is computed as 2 sin^2(theta/2), exact for small angles too.
     """
+    check_mechanics(pendulum, state)
     omega1, omega2 = velocities(pendulum, state)
     _, cos_delta = sincos(state.theta1 - state.theta2)
     v1, v2 = pendulum.l1 * omega1, pendulum.l2 * omega2
@@ -250,15 +321,16 @@ def energy_scale(pendulum: Pendulum, state: State) -> Scalar:
     return weights * jnp.abs(pendulum.g) + kinetic.kinetic1 + kinetic.kinetic2
 
 
-def positions(pendulum: Pendulum, state: State) -> Positions:
+def positions(pendulum: Pendulum | Any, state: State | Any) -> Positions:
     """Where the bobs are [m]: x to the right, y upwards, the pivot at the origin."""
+    check_mechanics(pendulum, state)
     sin1, cos1 = sincos(state.theta1)
     sin2, cos2 = sincos(state.theta2)
     x1, y1 = pendulum.l1 * sin1, -pendulum.l1 * cos1
     return Positions(x1, y1, x1 + pendulum.l2 * sin2, y1 - pendulum.l2 * cos2)
 
 
-def normal_modes(pendulum: Pendulum) -> tuple[NormalMode, NormalMode]:
+def normal_modes(pendulum: Pendulum | Any) -> tuple[NormalMode, NormalMode]:
     """The two small oscillations about the hanging state, slow (in-phase) first.
 
     A mode swings like a simple pendulum of length L with (L - l1)(L - l2) = kappa l1 l2, kappa = m2/(m1 + m2), so
@@ -267,8 +339,15 @@ def normal_modes(pendulum: Pendulum) -> tuple[NormalMode, NormalMode]:
     Raises:
         ValueError: g is a number that is not positive: nothing swings.
     """
-    if isinstance(pendulum.g, np.floating) and not pendulum.g > 0:
-        raise ValueError(f"g must be positive for normal modes, got {pendulum.g}: nothing swings without gravity")
+    check_pendulum(pendulum)
+    gravity = None if np.ndim(pendulum.g) else known_value(pendulum.g)
+    if gravity is not None and not gravity > 0:
+        raise ValueError(f"g must be positive for normal modes, got {gravity}: nothing swings without gravity")
+    return _modes(pendulum, pendulum.g)
+
+
+def _modes(pendulum: Pendulum, gravity: Scalar) -> tuple[NormalMode, NormalMode]:
+    """The normal modes under another gravity, which is not looked at."""
     l1, l2 = pendulum.l1, pendulum.l2
     share = pendulum.m2 / (pendulum.m1 + pendulum.m2)
     difference = l1 - l2
@@ -281,7 +360,7 @@ def normal_modes(pendulum: Pendulum) -> tuple[NormalMode, NormalMode]:
     short = pendulum.m1 / (pendulum.m1 + pendulum.m2) * l1 * l2 / long
 
     def mode(length: Scalar, ratio: Scalar) -> NormalMode:
-        frequency = jnp.sqrt(pendulum.g / length)
+        frequency = jnp.sqrt(gravity / length)
         return NormalMode(frequency, ratio, 2 * jnp.pi / frequency)
 
     return mode(long, 2 * l1 / plus), mode(short, -2 * l1 / minus)
@@ -289,15 +368,21 @@ def normal_modes(pendulum: Pendulum) -> tuple[NormalMode, NormalMode]:
 
 def fast_frequency(pendulum: Pendulum) -> Scalar:
     """The fast mode's angular frequency [rad/s] for |g|: where gravity pulls upwards, the fastest rate of escape."""
-    return normal_modes(replace(pendulum, g=jnp.abs(pendulum.g)))[1].frequency
+    return _modes(pendulum, jnp.abs(pendulum.g))[1].frequency
 
 
-def equilibria(pendulum: Pendulum) -> Equilibria:
+def equilibria(pendulum: Pendulum | Any) -> Equilibria:
     """The four equilibria with the exponents of the linear flow about them.
 
     About (s1, s2) = (cos theta1, cos theta2) = (+-1, +-1) a solution exp(lambda t) has lambda^2 = g/q with
     (q + s1 l1)(q + s2 l2) s1 s2 = kappa l1 l2 s1 s2, kappa = m2/(m1 + m2); both q are real.
+
+    Raises:
+        ValueError: leaves that are arrays: `jax.vmap` maps over many.
     """
+    check_pendulum(pendulum)
+    for name, leaf in vars(pendulum).items():
+        single(name, leaf)
     angles = np.array([[0.0, 0.0], [0.0, np.pi], [np.pi, 0.0], [np.pi, np.pi]]).T
     signs = jnp.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
     l1, l2, m1, m2, g = (jnp.asarray(value, jnp.float64) for value in jax.tree.leaves(pendulum))

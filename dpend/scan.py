@@ -20,6 +20,7 @@ In natural units, and in NumPy but for the lanes.
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -44,8 +45,11 @@ _ROW = 0.05
 _COARSE, _MOST_ROWS, _LONGEST = 0.02, 8192, 2048
 # Cells looked at together: as many as fit a cache.
 _BATCH = 512 * 320
-# So many motions are integrated at most: what is undecided then stays so.
-_MOST_MOTIONS = 200_000
+# What a search will take is told from motions on so many intervals. Each wave that p makes along theta2 costs
+# about so many motions (8 to 46 over 30 slices of three pendulums), and there are so many returns to a wave
+# (2 to 7). Waves are counted with and without the steepest intervals, this share of all, and the geometric mean
+# is taken: alone the one is up to a hundred times too large, and the other four times too small.
+_PROBES, MOTIONS_PER_WAVE, RETURNS_PER_WAVE, _STEEPEST = 128, 20, 3, 0.05
 # Intervals [rad] narrower than this are not halved: rounding, magnified as the tangent is, would be all there is.
 _NARROWEST = 1e-11
 # The share of the measured error that is kept clear of: halving an interval takes a cubic's error down sixteen times.
@@ -59,6 +63,37 @@ _DOMINANCE = 0.9
 # A zero this far outside its cell, as a share of it, still counts, for the bicubic's may be off. Two of the same sign
 # that are nearer than the second to each other are one, found from both sides of an edge.
 _EDGE, _SAME = 0.02, 0.1
+
+
+@dataclass
+class Budget:
+    """What a search may spend, in time steps: one for each row of each motion, 2 to 8 microseconds on one core.
+
+    Attributes:
+        most: beyond, nothing new is begun.
+        spent: so far.
+        tell: called with what was spent, often.
+    """
+
+    most: int
+    spent: int = 0
+    tell: Callable[[int], None] | None = None
+
+    def spend(self, steps: int) -> None:
+        self.spent += steps
+        if self.tell is not None:
+            self.tell(self.spent)
+
+    @property
+    def exhausted(self) -> bool:
+        return self.spent >= self.most
+
+
+class Outlook(NamedTuple):
+    """What a scan has before it: the rows of each motion, and the waves that p makes along theta2."""
+
+    rows: int
+    waves: float
 
 
 class Zero(NamedTuple):
@@ -81,9 +116,10 @@ class Scan:
         zeros: in order of theta2.
         motions: how many were integrated.
         rows: how many times each was looked at.
-        open_cells: (theta2, width) of intervals that were left undecided: too narrow to halve, beyond the number of
-            motions that are worth it, or not finite.
+        open_cells: (theta2, width) of intervals that were left undecided: too narrow to halve, beyond the
+            budget, or not finite.
         winding: of p at the last time as theta2 goes round, clockwise: the way round the rectangle that keeps it left.
+        exhausted: whether the budget ended the search.
     """
 
     zeros: tuple[Zero, ...]
@@ -91,11 +127,7 @@ class Scan:
     rows: int
     open_cells: tuple[tuple[float, float], ...]
     winding: int
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether the search was broken off, more motions being worth no more."""
-        return self.motions >= _MOST_MOTIONS
+    exhausted: bool
 
     @property
     def degree(self) -> int:
@@ -119,20 +151,42 @@ class _TooCoarse(Exception):
     """The rows lie too far apart for the motion."""
 
 
-def scanned(pendulum: Pendulum, theta1: float, duration: float, intervals: int) -> Scan:
+def scanned(pendulum: Pendulum, theta1: float, duration: float, intervals: int, budget: Budget) -> Scan:
     """All returns to rest up to `duration`, from so many intervals of theta2 to begin with.
 
     Arguments:
         pendulum: in natural units, its fields numbers; so is the duration, at most `longest`.
         theta1: [rad].
+        budget: what the scan, and others, may spend.
     """
-    rows = _WINDOW * math.ceil(duration * float(fast_frequency(pendulum)) / _ROW / _WINDOW)
+    rows = _rows_of(pendulum, duration)
     while 2 * rows <= _MOST_ROWS:
         try:
-            return _Scanner(pendulum, theta1, duration / rows, rows, coarse=False).run(intervals)
+            return _Scanner(pendulum, theta1, duration / rows, rows, False, budget).run(intervals)
         except _TooCoarse:
             rows *= 2
-    return _Scanner(pendulum, theta1, duration / rows, rows, coarse=True).run(intervals)
+    return _Scanner(pendulum, theta1, duration / rows, rows, True, budget).run(intervals)
+
+
+def _rows_of(pendulum: Pendulum, duration: float) -> int:
+    return _WINDOW * math.ceil(duration * float(fast_frequency(pendulum)) / _ROW / _WINDOW)
+
+
+def foresee(pendulum: Pendulum, theta1: float, duration: float) -> Outlook:
+    """What `scanned` will take: from the slopes of a few motions, without looking for returns.
+
+    The slope's mean over theta2, against the usual size of p, is the number of waves. It grows like the distance
+    of neighbouring motions, and intervals must be as narrow as the waves.
+    """
+    rows = _rows_of(pendulum, duration)
+    scanner = _Scanner(pendulum, theta1, duration / rows, rows, True, Budget(0))
+    value, _, slope, _ = scanner.motions(np.linspace(-np.pi, np.pi, _PROBES + 1))
+    with np.errstate(all="ignore"):
+        size, steep = (np.nan_to_num(np.hypot(*each)[1:], posinf=0.0) for each in (value, slope))
+        steep = np.sort(steep / np.median(size, axis=1)[:, None], axis=1)
+        usual = steep[:, : math.ceil((1 - _STEEPEST) * steep.shape[1])]
+        waves = np.sqrt(np.mean(steep, axis=1) * np.mean(usual, axis=1))
+    return Outlook(rows, float(np.max(waves[np.isfinite(waves)], initial=0.0)))
 
 
 def longest(pendulum: Pendulum) -> float:
@@ -149,6 +203,7 @@ class _Scanner:
     dt: float
     rows: int
     coarse: bool  # whether rows too far apart are put up with
+    budget: Budget
 
     def run(self, intervals: int) -> Scan:
         edges = np.linspace(-np.pi, np.pi, intervals + 1)
@@ -163,20 +218,24 @@ class _Scanner:
                 known = self.motions(some)
                 motions += len(some)
                 some = _Intervals(some[:-1], some[1:], known[..., :-1], known[..., 1:])
+            if self.budget.exhausted:
+                open_cells += _places(some)
+                turned += _turned(some)
+                continue
             for half in self._halved(some):
                 found, undecided = self._looked_at(half.intervals, half.error)
-                wide = (half.intervals.right - half.intervals.left > _NARROWEST) & (motions < _MOST_MOTIONS)
+                wide = half.intervals.right - half.intervals.left > _NARROWEST
                 wide &= np.all(np.isfinite(half.error), axis=0)
                 zeros += found
                 again = half.intervals.some(np.flatnonzero(undecided & wide))
                 waiting += [again.some(slice(i, i + batch)) for i in range(0, len(again.left), batch)]
-                left = half.intervals.some(np.flatnonzero(undecided & ~wide))
-                open_cells += zip(left.left.tolist(), (left.right - left.left).tolist(), strict=True)
+                open_cells += _places(half.intervals.some(np.flatnonzero(undecided & ~wide)))
                 settled = half.intervals.some(np.flatnonzero(~(undecided & wide)))
                 turned += _turned(settled)
             motions += len(some.left)
         winding = round(turned / (2 * np.pi)) if math.isfinite(turned) else 0
-        return Scan(_distinct(zeros, self.dt), motions, self.rows + 1, tuple(open_cells), winding)
+        spent = self.budget.exhausted
+        return Scan(_distinct(zeros, self.dt), motions, self.rows + 1, tuple(open_cells), winding, spent)
 
     def _taken(self, waiting: list[Any], batch: int) -> Any:
         """The next edges, or as many intervals as fit a batch."""
@@ -196,6 +255,7 @@ class _Scanner:
         for _ in range(self.rows // _WINDOW):
             each, rows = over_lanes(_window, shared, each)
             parts.append(np.swapaxes(rows, 0, 1))
+        self.budget.spend(self.rows * theta2.size)
         table = np.concatenate(parts, axis=1).reshape(4, 2, self.rows + 1, -1)
         if not (self.coarse or np.all(np.isfinite(table))):
             raise _TooCoarse
@@ -275,6 +335,11 @@ class _Scanner:
                 foretold = 0.5 * (before[0] + after[0]) + self.dt / 4 * (before[1] - after[1])
                 missed = np.maximum(missed, np.max(np.abs(foretold - here[0]), axis=0))
         return missed / 16
+
+
+def _places(some: _Intervals) -> list[tuple[float, float]]:
+    """Where intervals begin, and how wide they are."""
+    return list(zip(some.left.tolist(), (some.right - some.left).tolist(), strict=True))
 
 
 class _Half(NamedTuple):

@@ -22,8 +22,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Complex, Float
 
-from dpend.pendulum import Pendulum, Scalar, State
-from dpend.steppers import Point, Scheme
+from dpend.checks import known_number, known_real, known_value, real, single
+from dpend.pendulum import Pendulum, Scalar, State, check_motion
+from dpend.steppers import Point, Scheme, check_scheme
 from dpend.trajectory import march, step_size
 
 
@@ -46,14 +47,19 @@ def transition(
     return scheme.leave(constants, end), jnp.stack(jax.tree.leaves(tangents))
 
 
-def monodromy(pendulum: Pendulum, state: State, period: float, scheme: Scheme) -> Float[Array, "4 4"]:
+def monodromy(
+    pendulum: Pendulum | Any, state: State | Any, period: float | Any, scheme: Scheme | Any
+) -> Float[Array, "4 4"]:
     """The derivative of the flow over a whole period: needs no symmetry, and is noise once kappa exceeds 1e12.
 
     Arguments:
         period: the time [s], known before tracing.
     Raises:
-        ValueError: the step is longer than the period.
+        ValueError: the step is longer than the period; arguments of other classes, arrays, a traced period.
     """
+    check_motion(pendulum, state)
+    check_scheme(scheme)
+    period = known_number("period", period, unit="s")
     steps = scheme.steps(period)
     return transition(pendulum, state, step_size(period, steps), steps, scheme)[1]
 
@@ -104,11 +110,7 @@ def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, 
         symmetry: `centred`, `brake` or `odd`.
         xp: numpy, or jax.numpy under differentiation.
     """
-    product, scale = xp.eye(4), xp.zeros(matrices.shape[:-3])
-    for i in range(matrices.shape[-3]):
-        product = matrices[..., i, :, :] @ product
-        size = lax.stop_gradient(abs(product).max(axis=(-2, -1))) if xp is jnp else abs(product).max(axis=(-2, -1))
-        product, scale = product / size[..., None, None], scale + xp.log(size)
+    product, scale = _product(matrices, xp)
     if symmetry == "odd":
         offset, trace = -1.0, -0.5 * product.trace(axis1=-2, axis2=-1)
     elif symmetry == "centred":
@@ -120,10 +122,33 @@ def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, 
     logarithm = xp.where(beyond, scale, 0.0) + _log_abs(xp.where(beyond, trace, value), xp)
     if symmetry == "brake":
         return xp.full_like(value, xp.nan), value, logarithm
-    kappa = 2 * xp.where(abs(value) < _LARGEST_C, value, _LARGEST_C) ** 2 - 1
+    kappa = 2 * xp.where(abs(value) < LARGEST_C, value, LARGEST_C) ** 2 - 1
     inner = logarithm > _MANY_DIGITS
     twice = math.log(2.0) + 2 * logarithm
     return value, kappa, xp.where(inner, twice, _log_abs(xp.where(inner, 1.0, kappa), xp))
+
+
+def _product(matrices: Any, xp: Any) -> tuple[Any, Any]:
+    """The product of consecutive matrices, its largest entry made 1, and the logarithm of what it was divided by."""
+    product, scale = xp.eye(4), xp.zeros(matrices.shape[:-3])
+    for i in range(matrices.shape[-3]):
+        product = matrices[..., i, :, :] @ product
+        size = lax.stop_gradient(abs(product).max(axis=(-2, -1))) if xp is jnp else abs(product).max(axis=(-2, -1))
+        product, scale = product / size[..., None, None], scale + xp.log(size)
+    return product, scale
+
+
+def growth_of(matrices: np.ndarray, symmetry: str) -> np.ndarray:
+    """What rounding is multiplied by in the c, or kappa of brake orbits, that `stability_of` makes of Phi.
+
+    Both are sums of products of entries of Phi, of `odd` orbits of entries, that may cancel. The blocks are measured so
+    that the unit of momentum does not count.
+    """
+    product, scale = _product(matrices, np)
+    blocks = product[..., :2, :2], product[..., 2:, 2:], product[..., :2, 2:], product[..., 2:, :2]
+    a, d, b, c = (abs(block).max(axis=(-2, -1)) for block in blocks)
+    logarithm = scale + np.log(np.maximum(np.maximum(a, d), np.sqrt(b * c)))
+    return np.asarray(np.exp(np.minimum((1 if symmetry == "odd" else 2) * logarithm, _LARGEST_EXPONENT)))
 
 
 def _log_abs(value: Any, xp: Any) -> Any:
@@ -132,19 +157,30 @@ def _log_abs(value: Any, xp: Any) -> Any:
 
 
 # exp of the first is still finite; beyond exp of the second the 1 that is added does not show.
-_LARGEST_EXPONENT, _MANY_DIGITS, _LARGEST_C = 700.0, 20.0, 1e150
+_LARGEST_EXPONENT, _MANY_DIGITS, LARGEST_C = 700.0, 20.0, 1e150
 
 
-def multipliers(kappa: Scalar) -> Complex[Array, "4"]:
-    """The Floquet multipliers 1, 1, m, 1/m with m + 1/m = 2 kappa and |m| >= 1."""
-    kappa = jnp.asarray(kappa, jnp.complex128)
+def multipliers(kappa: Scalar) -> Complex[Array, "4 ..."]:
+    """The Floquet multipliers 1, 1, m, 1/m with m + 1/m = 2 kappa and |m| >= 1, NaN where kappa is.
+
+    Raises:
+        ValueError: kappa is neither a real number nor an array of them.
+    """
+    kappa = jnp.asarray(real("kappa", kappa), jnp.complex128)
     large = kappa + jnp.sqrt(kappa - 1) * jnp.sqrt(kappa + 1)  # the two principal roots never cancel against kappa
     one = jnp.ones_like(large)
     return jnp.stack([one, one, large, 1 / large])
 
 
-def stability_class(kappa: float) -> str:
-    """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where kappa is NaN."""
+def stability_class(kappa: float | Any) -> str:
+    """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where kappa is NaN.
+
+    Raises:
+        ValueError: kappa is no single real number, or traced by `jit`.
+    """
+    single("kappa", real("kappa", kappa))
+    known = known_value(kappa)
+    kappa = known_real("kappa", kappa) if known is None else known
     if kappa != kappa:
         return "unknown"
     if abs(kappa) == 1:

@@ -31,13 +31,14 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from dpend.checks import flag, instance, known_number, one_of
 from dpend.pendulum import (
     Pendulum,
     Scalar,
     State,
     fast_frequency,
     hamiltonian,
-    number,
+    known_pendulum,
     vector_field,
 )
 from dpend.trig import sincos
@@ -135,14 +136,25 @@ _WRITTEN_OUT = 4
 
 
 def explicit_step(
-    tableau: Tableau, increment: Callable[[Point], Point], point: Point, *, written_out: bool = True
+    tableau: Tableau,
+    increment: Callable[[Point], Point],
+    point: Point,
+    *,
+    written_out: bool = True,
+    onto: Point | None = None,
 ) -> Point:
-    """One step of an explicit Runge-Kutta method, where increment(point) is the slope at a point times the step."""
+    """One step of an explicit Runge-Kutta method.
+
+    Arguments:
+        increment: increment(point) is the slope at a point times the step.
+        onto: what the step is added to, by default the point itself.
+    """
+    base = point if onto is None else onto
     if written_out:
         slopes: list[Point] = []
         for row in tableau.a:
             slopes.append(increment(_displaced(point, row, slopes)))
-        return _displaced(point, tableau.b, slopes)
+        return _displaced(base, tableau.b, slopes)
     # Rows, one for each number that a leaf holds for each lane, so that a stage is one pass over contiguous lanes.
     leaves, structure = jax.tree.flatten(point)
     lanes = min((jnp.shape(leaf) for leaf in leaves), key=len)
@@ -164,7 +176,7 @@ def explicit_step(
         return lax.dynamic_update_index_in_dim(slopes, rows(increment(tree(here))), index, 0)
 
     slopes_table = lax.fori_loop(0, stages, stage, jnp.zeros((stages, *start.shape)))
-    return tree(sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=start))
+    return tree(sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=rows(base)))
 
 
 def _displaced(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Point:
@@ -486,17 +498,18 @@ class Scheme:
         written_out: whether all stages of a step are written out, or run as a loop: slower to compile, faster for many
             lanes. By default the circle forms are, and order 8 in (theta, p) is not.
     Raises:
-        ValueError: an unknown name; a step that is not finite and positive.
+        ValueError: an unknown name; a step that is not finite and positive, or traced; written_out not a boolean.
     """
 
-    name: str
-    step: float
-    written_out: bool | None = None
+    name: str | Any
+    step: float | Any
+    written_out: bool | Any | None = None
 
     def __post_init__(self) -> None:
-        if self.name not in METHODS:
-            raise ValueError(f"method must be one of {', '.join(METHODS)}, got {self.name!r}")
-        object.__setattr__(self, "step", float(number("step", self.step, positive=True, unit="s")))
+        object.__setattr__(self, "name", one_of("method", self.name, tuple(METHODS)))
+        object.__setattr__(self, "step", known_number("step", self.step, positive=True, unit="s"))
+        if self.written_out is not None:
+            object.__setattr__(self, "written_out", flag("written_out", self.written_out))
 
     @property
     def order(self) -> int:
@@ -556,6 +569,22 @@ class Scheme:
         tableau = METHODS[self.name].tableau
         return explicit_step(tableau, partial(increment, constants), point, written_out=not self._rolled)
 
+    def move_compensated(self, constants: Any, point: Point, rest: Point) -> tuple[Point, Point]:
+        """The point one step later, the rounding errors of its sums kept (compensated summation).
+
+        Arguments:
+            rest: what rounding has taken from the sums so far, zeros at the start; the same tree as the point.
+        Returns:
+            The point and the rest, which together are the motion.
+        """
+        if self._implicit:
+            return self.move(constants, point), rest  # its points hold a rest of their own
+        increment = partial(_circle_increment if self._circle else _canonical_increment, constants)
+        tableau = METHODS[self.name].tableau
+        change = explicit_step(tableau, increment, point, written_out=not self._rolled, onto=rest)
+        ahead = jax.tree.map(jnp.add, point, change)
+        return ahead, jax.tree.map(lambda old, new, change: (old - new) + change, point, ahead, change)
+
     def move_tangents(self, constants: Any, point: Point, tangents: State) -> tuple[Point, State]:
         """One step of a point together with tangent vectors of it.
 
@@ -613,19 +642,39 @@ class Scheme:
         longest = _LONGEST_PACE ** (1 / _PACE_POWER)
         return lax.stop_gradient(jnp.clip(height, longest, 1.0) ** _PACE_POWER)
 
-    def steps(self, duration: float) -> int:
+    def steps(self, duration: float | Any) -> int:
         """The number of even steps that a motion of `duration` [s] takes: ceil(|duration|/step - 1e-9).
 
         Raises:
-            ValueError: the step is longer than the motion.
+            ValueError: the step is longer than the motion, or so short that they would never end; the duration is no
+                known finite number.
         """
+        duration = known_number("duration", duration, unit="s")
         count = abs(duration) / self.step
+        if count > _MOST_STEPS:
+            raise ValueError(
+                f"step must make at most {_MOST_STEPS:.0e} steps, got {self.step:g} s, which makes {count:.3g}: "
+                "give a larger step, or a shorter duration"
+            )
         if 0.0 < count < 1.0 - 1e-9:
             raise ValueError(
                 f"step must not be longer than the motion of {abs(duration):g} s, got {self.step:g}: "
                 "give a smaller step"
             )
         return math.ceil(count - 1e-9)
+
+
+def check_scheme(scheme: Any) -> None:
+    """Refuses what is no `Scheme`.
+
+    Raises:
+        ValueError: another class, a method's name among them.
+    """
+    instance("scheme", scheme, Scheme, 'dpend.Scheme("rk8", 1e-3) or dpend.scheme_for(pendulum, 1e-9)')
+
+
+# A week of one motion at two million steps a second: what takes longer does not end.
+_MOST_STEPS = 1e12
 
 
 # The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th percentile over
@@ -677,7 +726,7 @@ _SHORTER_FOR_MASSES = (
 )
 
 
-def scheme_for(pendulum: Pendulum, tolerance: float) -> Scheme:
+def scheme_for(pendulum: Pendulum | Any, tolerance: float | Any) -> Scheme:
     """The fastest scheme for many motions whose angles are to be right to `tolerance`, 99 in 100 of them.
 
     "Right" is measured on releases from rest over the whole square of angles, after about two periods of the slow
@@ -688,9 +737,10 @@ def scheme_for(pendulum: Pendulum, tolerance: float) -> Scheme:
         tolerance: of the larger angle [rad]; below 2e-11 the step is that of 2e-11, where rounding takes over, above
             3e-2 that of 3e-2. Measured for mass ratios m2/m1 of 0.01 to 100 and lengths l2/l1 of 0.25 to 4.
     Raises:
-        ValueError: tolerance not positive; gravity zero, which sets no time.
+        ValueError: tolerance not positive; gravity zero, which sets no time; a traced argument.
     """
-    tolerance = float(number("tolerance", tolerance, positive=True, unit="rad"))
+    pendulum = known_pendulum(pendulum)
+    tolerance = known_number("tolerance", tolerance, positive=True, unit="rad")
     frequency = float(fast_frequency(pendulum))
     if not frequency > 0:
         raise ValueError(f"g must not be zero for a tolerance, got {float(pendulum.g)}: give a method and a step")

@@ -7,7 +7,7 @@ doubled until two doublings have shown no new family: one that was missed turns 
 with both its rests.
 """
 
-import json
+import hashlib
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -19,13 +19,29 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.atlas import Atlas, Coverage, is_return, known_period, returns, stacked, table_of
+from dpend.atlas import (
+    BEYOND,
+    COUNTABLE,
+    MOST_STEPS,
+    STEPS_PER_ORBIT,
+    Atlas,
+    Coverage,
+    foresee_returns,
+    is_return,
+    known_budget,
+    known_period,
+    returns,
+    stacked,
+    table_of,
+)
+from dpend.catalogue import check_least, check_record, check_type
+from dpend.checks import file_path, function, known_number
 from dpend.continuation import away_from, way_to
-from dpend.families import Family, follow_family, known_pendulum
-from dpend.files import check_place, json_text, replacing
-from dpend.orbits import PeriodicOrbit, find_orbit
+from dpend.families import Family, follow_family
+from dpend.files import check_place, json_text, parse_json, read_text, replacing
+from dpend.orbits import PeriodicOrbit, find_orbit, swinging_pendulum
 from dpend.pendulum import Pendulum
-from dpend.scan import Zero
+from dpend.scan import MOTIONS_PER_WAVE, Budget, Zero
 from dpend.trajectory import Status
 
 # Doublings of the slices: this many to begin with, and at most so many. Slices are odd multiples of pi/2^(level + 1).
@@ -36,17 +52,26 @@ _INTERVALS, _MORE_INTERVALS = 128, 1024
 # [rad, and log of the period], or to the third of their length where releases run faster than arclength: what is nearer
 # to a chord belongs to its family.
 _STEP, _NEAR, _BENT = 0.02, 3e-3, 0.05
+# What following a family takes in time steps of a motion, point by point, and holding a return against its
+# chords: for all of them, and one more for so many each.
+_STEPS_PER_POINT, _STEPS_TO_HOLD, _CHORDS_PER_STEP = 2500, 5, 30
+# Families have about so many points, slices are about so many, and there are so many families to a wave of p: 13
+# for 5.7 waves of the paper's pendulum at 2 s.
+_USUAL_POINTS, _USUAL_SLICES, _FAMILIES_PER_WAVE = 150, 127, 2
+# Points on one side of where a family was met: the longest of the published catalogue has 188 in all.
+_MOST_POINTS = 2000
 # In a slice, where a curve that runs along it makes more of the same error, partners are this close; where it turns
 # back, two passages of one family.
 _PARTNER, _PAIR = 0.03, 0.1
 
 
 def find_brake_families(
-    pendulum: Pendulum,
+    pendulum: Pendulum | Any,
     *,
     max_period: Any,
-    store: str | os.PathLike[str] | None = None,
-    progress: Callable[[int, int, int], None] | None = None,
+    store: str | os.PathLike[str] | Any | None = None,
+    most_steps: Any = MOST_STEPS,
+    progress: Callable[[int, int, int], None] | Any | None = None,
 ) -> Atlas:
     """Every family of orbits released from rest with a period of at most `max_period`, on the whole square of angles.
 
@@ -57,7 +82,10 @@ def find_brake_families(
         pendulum: its fields are numbers; g positive.
         max_period: [s]. The number of families, and the time it takes, grows exponentially with it.
         store: F.json, written after every slice; a search that was stopped goes on from there.
-        progress: called with slices done, slices planned so far, and families found, after every slice.
+        most_steps: time steps of all motions, 2 to 8 microseconds each on one core. A search that will take more is
+            refused before it begins; one that takes more after all ends there, its coverage says `exhausted`, and with
+            a store it can be taken up again.
+        progress: called with slices done, slices planned so far, and families found, after every slice and family.
     Returns:
         Atlas, family by family, in order of arclength from the end with the shorter period. Families are called C1, C2
         (centred) and B1, B2 (brake) in order of their shortest period, so that a name does not depend on how a family
@@ -66,29 +94,56 @@ def find_brake_families(
         and `longest_period_s`, `special_points` with kind, arclength, release in degrees, period and kappa.
     Raises:
         ValueError: max_period not positive, or so long that the fast normal mode would swing 32 times; g not positive;
-            a traced argument; a store made with other settings.
+            a traced argument; most_steps not enough; lengths, masses or g whose products leave the range of float64; a
+            store made with other settings, damaged, or no file.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
-    fixed = known_pendulum(pendulum)
+    fixed = swinging_pendulum(pendulum)
+    most_steps = known_number("most_steps", most_steps, positive=True)
     max_period = known_period(fixed, max_period)
+    path = None if store is None else file_path("store", store)
+    if progress is not None:
+        function("progress", progress, "(slices done, slices planned, families)", "print")
+    if path is not None:
+        check_place("store", path, (".json",))
     survey = _Survey(fixed, max_period)
-    if store is not None:
-        survey = _resumed(survey, Path(store))
+    record = _read_store(survey, path) if path is not None and path.exists() else None
+    survey.budget = budget = known_budget(most_steps, expected_steps(fixed, max_period), max_period)
+    if path is not None and record is not None:
+        _resume(survey, record, path)
     for level in range(_MOST_LEVELS):
-        angles = np.pi * (2 * np.arange(2**level) + 1) / 2 ** (level + 1)
         planned = 2 ** (max(level + 1, _FIRST_LEVELS)) - 1
-        for angle in angles.tolist():
-            if angle not in survey.slices:
+        if progress is not None:
+            budget.tell = lambda _, planned=planned: progress(len(survey.slices), planned, len(survey.tracks))
+            budget.spend(0)
+        for angle in _angles(level):
+            if angle not in survey.slices and not budget.exhausted:
                 survey.look_at(angle, level)
-                if store is not None:
-                    _keep(survey, Path(store))
-            if progress is not None:
-                progress(len(survey.slices), planned, len(survey.tracks))
+                if path is not None and angle in survey.slices:
+                    _keep(survey, path)
+                budget.spend(0)
         newest = max((track.level for track in survey.tracks), default=0)
-        if level + 1 >= _FIRST_LEVELS and level - newest >= _LEVELS_WITHOUT_NEWS:
+        settled = level + 1 >= _FIRST_LEVELS and level - newest >= _LEVELS_WITHOUT_NEWS
+        if settled or budget.exhausted:
             break
     return survey.atlas(level)
+
+
+def expected_steps(pendulum: Pendulum, max_period: float) -> int:
+    """The time steps that `find_brake_families` will take, roughly, from what three slices have before them."""
+    seen = [foresee_returns(pendulum, angle, max_period) for level in range(2) for angle in _angles(level)]
+    waves = sum(one.waves for one in seen) / len(seen)
+    motions = 2 * _INTERVALS + MOTIONS_PER_WAVE * waves
+    slices = _USUAL_SLICES * motions * seen[0].rows
+    families = _FAMILIES_PER_WAVE * waves * _USUAL_POINTS * _STEPS_PER_POINT
+    return int(min(slices + families, COUNTABLE))
+
+
+def _angles(level: int) -> list[float]:
+    """The slices of a level."""
+    angles: list[float] = (np.pi * (2 * np.arange(2**level) + 1) / 2 ** (level + 1)).tolist()
+    return angles
 
 
 # --- families as curves of releases -----------------------------------------------------------------------------------
@@ -141,6 +196,11 @@ class _Track:
         )
         return bool(np.mean([self.holds(point) for point in points]) > 0.5)
 
+    @property
+    def price(self) -> int:
+        """What it takes to hold a return against it, in time steps of a motion."""
+        return _STEPS_TO_HOLD + len(self.chords) // _CHORDS_PER_STEP
+
     def passages(self, theta1: float) -> np.ndarray:
         """(theta2, period) where it passes a slice, shape (n, 2)."""
         start, end = self.chords[:, 0], self.chords[:, 1]
@@ -186,27 +246,33 @@ class _Survey:
     max_period: float
     slices: dict[float, _Slice] = field(default_factory=dict)
     tracks: list[_Track] = field(default_factory=list)
+    budget: Budget = field(default_factory=lambda: Budget(MOST_STEPS))
 
     def look_at(self, theta1: float, level: int) -> None:
-        """Scans a slice, and follows what belongs to no family yet."""
-        result = returns(self.pendulum, theta1, self.max_period, _INTERVALS)
+        """Scans a slice, and follows what belongs to no family yet; a slice that the budget cuts short is none."""
+        result = returns(self.pendulum, theta1, self.max_period, _INTERVALS, self.budget)
         if result.open_cells or result.degree != result.winding:
-            result = returns(self.pendulum, theta1, self.max_period, _MORE_INTERVALS)
+            result = returns(self.pendulum, theta1, self.max_period, _MORE_INTERVALS, self.budget)
         zeros = sorted(result.zeros, key=lambda zero: zero.time)
         found = _Slice(
             result.motions, result.rows, len(result.open_cells), result.winding, result.degree,
             [[zero.theta2, 2 * zero.time] for zero in zeros],
         )  # fmt: skip
         for zero in zeros:
+            if self.budget.exhausted:
+                return
             if 2 * zero.time <= self.max_period and not self._known(theta1, zero.theta2, 2 * zero.time):
                 found.lost += not self._follow(theta1, zero, level)
-        self.slices[theta1] = found
+        if not self.budget.exhausted:
+            self.slices[theta1] = found
 
     def _known(self, theta1: float, theta2: float, period: float) -> bool:
         """Whether a return is that of a known family, run through once or several times."""
         for track in self.tracks:
             shortest = float(np.exp(np.min(track.chords[:, :, 2])))
-            for cover in range(1, int(period / shortest + 1e-3) + 1):
+            covers = int(period / shortest + 1e-3)
+            self.budget.spend(covers * track.price)
+            for cover in range(1, covers + 1):
                 if track.holds(np.array([theta1, theta2, math.log(period / cover)])):
                     return True
         return False
@@ -218,7 +284,9 @@ class _Survey:
         if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
             return False
         new = self.track(orbit, seed, level)
+        self.budget.spend(STEPS_PER_ORBIT + len(new.family.arclength) * _STEPS_PER_POINT)
         for i, track in enumerate(self.tracks):
+            self.budget.spend(len(new.family.arclength) * track.price)
             if track.is_same(new):
                 # Met where its chords were not near enough; the one that was followed further stays.
                 if len(new.chords) > len(track.chords):
@@ -229,7 +297,9 @@ class _Survey:
 
     def track(self, orbit: PeriodicOrbit, seed: tuple[float, float, float], level: int) -> _Track:
         longest = max(self.max_period, float(orbit.period))
-        family = follow_family(self.pendulum, orbit, longest_step=_STEP, longest_period=longest)
+        family = follow_family(
+            self.pendulum, orbit, longest_step=_STEP, longest_period=longest, most_points=_MOST_POINTS
+        )
         return _Track.of(family, seed, level)
 
     def unmatched(self) -> list[tuple[float, float, float]]:
@@ -270,12 +340,13 @@ class _Survey:
         unsettled = sum(level - track.level < _LEVELS_WITHOUT_NEWS for track in self.tracks)
         coverage = Coverage(
             theta2_points=sum(one.motions for one in every),
-            time_points=max(one.rows for one in every),
+            time_points=max((one.rows for one in every), default=0),
             refinements=level,
             suspicious_cells=sum(one.doubts for one in every) + len(self.unmatched()) + unsettled,
             winding=sum(one.winding for one in every),
             degree=sum(one.degree for one in every),
             slices=len(self.slices),
+            exhausted=self.budget.exhausted,
         )
         return Atlas(self.pendulum, self.max_period, stacked(tables), tuple(records), coverage)
 
@@ -392,6 +463,20 @@ def _seen_from_the_other_end(kind: str) -> str:
 
 # --- the store --------------------------------------------------------------------------------------------------------
 
+# What a store says, and of what types.
+_STORE = {"settings": dict, "slices": list, "families": list, "checksum": str}
+_SLICE = {
+    "theta1": float,
+    "motions": int,
+    "rows": int,
+    "open_cells": int,
+    "winding": int,
+    "degree": int,
+    "returns": list,
+    "lost": int,
+}
+_SEED = {"seed": list, "level": int}
+
 
 def _settings(survey: _Survey) -> dict[str, Any]:
     import dpend
@@ -403,36 +488,93 @@ def _settings(survey: _Survey) -> dict[str, Any]:
     }
 
 
+def _checksum(record: dict[str, Any]) -> str:
+    """Of all else in a store: a search that went on from other numbers would be wrong and not show it."""
+    rest = {key: value for key, value in record.items() if key != "checksum"}
+    return hashlib.sha256(json_text(rest, indent=None).encode()).hexdigest()
+
+
 def _keep(survey: _Survey, path: Path) -> None:
-    record = {
+    record: dict[str, Any] = {
         "settings": _settings(survey),
         "slices": [{"theta1": theta1} | asdict(found) for theta1, found in survey.slices.items()],
         "families": [{"seed": list(track.seed), "level": track.level} for track in survey.tracks],
     }
     with replacing(path) as draft:
-        draft.write_text(json_text(record) + "\n")
+        draft.write_text(json_text(record | {"checksum": _checksum(record)}) + "\n")
 
 
-def _resumed(survey: _Survey, path: Path) -> _Survey:
-    """The search as a store left it."""
-    check_place("store", path, (".json",))
-    if not path.exists():
-        return survey
+def _read_store(survey: _Survey, path: Path) -> dict[str, Any]:
+    """What a store holds, refused unless it is of the same search and as it was written."""
     try:
-        record = json.loads(path.read_text())
-        settings, slices, families = (record[key] for key in ("settings", "slices", "families"))
-    except (ValueError, KeyError, TypeError):
+        record: dict[str, Any] = parse_json(read_text(path))
+        _check_store(record)
+    except (OSError, ValueError) as error:
+        raise _no_store(path, getattr(error, "strerror", None) or str(error)) from None
+    settings, kept = _settings(survey), record["settings"]
+    if kept != settings:
+        wrong = next(key for key in (*settings, *kept) if kept.get(key) != settings.get(key))
         raise ValueError(
-            f"store must be a file that find_brake_families wrote, got {path}: give another name"
-        ) from None
-    if settings != _settings(survey):
-        wrong = next(key for key, value in _settings(survey).items() if settings.get(key) != value)
-        raise ValueError(
-            f"store must have been made with the same settings, got {path} with {wrong} {settings.get(wrong)}: "
+            f"store must have been made with the same settings, got {path} with {wrong} {kept.get(wrong)!r:.200}: "
             "give another name"
         )
-    for family in families:
-        seed = tuple(family["seed"])
-        survey.tracks.append(survey.track(find_orbit(survey.pendulum, seed[0], guess=seed[1:]), seed, family["level"]))
-    survey.slices |= {one.pop("theta1"): _Slice(**one) for one in slices}
-    return survey
+    try:
+        _check_search(record, survey.max_period)
+    except ValueError as error:
+        raise _no_store(path, str(error)) from None
+    return record
+
+
+def _no_store(path: Path, reason: str) -> ValueError:
+    return ValueError(f"store must be a file that find_brake_families wrote, got {path} ({reason}): give another name")
+
+
+def _resume(survey: _Survey, record: dict[str, Any], path: Path) -> None:
+    """Takes up the search as a store left it: families are followed again, from the same returns."""
+    for i, family in enumerate(record["families"]):
+        theta1, theta2, period = map(float, family["seed"])
+        orbit = find_orbit(survey.pendulum, theta1, guess=(theta2, period))
+        if int(orbit.status) != Status.CONVERGED:
+            raise _no_store(path, f"families[{i}].seed is no orbit")
+        survey.tracks.append(survey.track(orbit, (theta1, theta2, period), family["level"]))
+    survey.slices |= {one.pop("theta1"): _Slice(**one) for one in record["slices"]}
+
+
+def _check_store(record: Any) -> None:
+    """Refuses what has not the form of a store, or was changed since it was written."""
+    check_record("the store", record, _STORE)
+    for i, one in enumerate(record["slices"]):
+        check_record(f"slices[{i}]", one, _SLICE)
+        for k, pair in enumerate(one["returns"]):
+            _check_numbers(f"slices[{i}].returns[{k}]", pair, 2)
+    for i, one in enumerate(record["families"]):
+        check_record(f"families[{i}]", one, _SEED)
+        _check_numbers(f"families[{i}].seed", one["seed"], 3)
+    if record["checksum"] != _checksum(record):
+        raise ValueError("it was changed since, or damaged: its checksum is another")
+
+
+def _check_numbers(place: str, value: Any, count: int) -> None:
+    check_type(place, value, list)
+    if len(value) != count:
+        raise ValueError(f"{place} must have {count} numbers, has {len(value)}")
+    for number in value:
+        check_type(place, number, float)
+
+
+def _check_search(record: dict[str, Any], max_period: float) -> None:
+    """Refuses slices that this search would not look at first, and families that none of their returns begins."""
+    wanted = [angle for level in range(_MOST_LEVELS) for angle in _angles(level)]
+    returns = set()
+    for i, one in enumerate(record["slices"]):
+        if i >= len(wanted) or one["theta1"] != wanted[i]:
+            raise ValueError(f"slices[{i}].theta1 is {one['theta1']:.10g}, which is not the next one")
+        for name in ("motions", "rows", "open_cells", "lost"):
+            check_least(f"slices[{i}].{name}", one[name], 0)
+        for theta2, period in one["returns"]:
+            if not (0 < period <= max_period * (1 + 2 * BEYOND) and abs(theta2) < 1.001 * math.pi):
+                raise ValueError(f"slices[{i}].returns has ({theta2:.10g}, {period:.10g}), outside of the search")
+            returns.add((one["theta1"], theta2, period))
+    for i, one in enumerate(record["families"]):
+        if tuple(one["seed"]) not in returns or not 0 <= one["level"] < _MOST_LEVELS:
+            raise ValueError(f"families[{i}] begins at none of the returns")

@@ -1,8 +1,8 @@
 """A quantity over a grid, as a labelled dataset, in memory or streamed into a Zarr store that can be resumed.
 
 The grid is cut into tiles, one chunk of the store each. A tile is computed as a whole, its values are written and
-synced to disk, and only then its status: whatever moment the process is killed at, the same call finishes the map with
-the bytes that an uninterrupted run would have given.
+synced to disk, then its status, then a digest of all: whatever moment the process is killed at, and whatever happens to
+the files after, the same call finishes the map with the bytes that an uninterrupted run would have given.
 """
 
 import hashlib
@@ -10,10 +10,11 @@ import inspect
 import json
 import math
 import os
-import shutil
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.files import unwritable
-from dpend.lanes import launches, over_lanes
-from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, number
+from dpend.checks import file_path, flag, function, known_number, numbers, shown, text
+from dpend.lanes import WIDTH, launches, over_lanes
+from dpend.pendulum import Pendulum, Scalar, State, hamiltonian, known_pendulum
 from dpend.steppers import Scheme, scheme_for
+from dpend.stores import Store, StoreWarning, check_store
 from dpend.trajectory import Status
 
 # (pendulum, state, scheme) -> named scalars.
@@ -51,24 +53,39 @@ _STATE = tuple(field.name for field in fields(State))
 _PENDULUM = tuple(field.name for field in fields(Pendulum))
 # Cells whose mirror images are computed too, to see what the mirror does to a quantity.
 _SAMPLES = 64
+# A sweep is refused beyond so many steps of all cells, or beyond this share of them in one motion. A map of
+# 4096 x 4096 cells takes 1e10 steps for 10 s at the default tolerance; 1e12 take a day on two cores. The steps
+# of one motion follow one another on one core: a million take some five seconds.
+_MOST_STEPS, _SHARE = 1e12, 1e-6
+# What a user may ask for at most: JAX counts a loop's turns in 64 bits.
+_COUNTABLE = 1e15
+# Steps of methods with uneven steps, for each step that fits into the duration: the mean over the square of releases,
+# 0.9 to 1.9 for four pendulums.
+_UNEVEN = 1.4
+# A motion whose steps would be so much shorter than the scheme's is given up as NaN at once.
+_LOST = 1e5
+# Steps that a core takes in a second, at order 8 with a tangent, for a first guess at how long a sweep takes.
+_RATE = 5e6
 # The default tolerance [rad]: a map's colours need no more.
 _TOLERANCE = 1e-6
 
 
 def sweep(
-    quantity: Quantity,
-    pendulum: Pendulum,
-    axes: Mapping[str, Any],
+    quantity: Quantity | Any,
+    pendulum: Pendulum | Any,
+    axes: Mapping[str, Any] | Any,
     *,
-    at: Mapping[str, float] | None = None,
-    tolerance: float | None = None,
-    method: str | None = None,
-    step: float | None = None,
-    error: str | None = None,
-    mirror: bool = True,
-    store: str | os.PathLike[str] | None = None,
-    name: str | None = None,
-    progress: Callable[[int, int, int], None] | None = None,
+    at: Mapping[str, float] | Any | None = None,
+    tolerance: float | Any | None = None,
+    method: str | Any | None = None,
+    step: float | Any | None = None,
+    error: str | Any | None = None,
+    mirror: bool | Any = True,
+    store: str | os.PathLike[str] | Any | None = None,
+    name: str | Any | None = None,
+    progress: Callable[[int, int, int], None] | Any | None = None,
+    announce: Callable[["Cost"], None] | Any | None = None,
+    most_steps: float | Any = _MOST_STEPS,
 ) -> Any:
     """A quantity over one or two fields of `State` or `Pendulum`.
 
@@ -87,28 +104,46 @@ def sweep(
         method, step: both, instead of a tolerance.
         error: "half-step" makes a second pass at half the step and adds |h - h/2| of each value as <name>_error.
         mirror: False computes every cell, also of symmetric maps.
-        store: a directory for a Zarr store. One left unfinished by a run with the same settings is finished; what is
-            returned is opened lazily.
+        store: a directory for a Zarr store. One left unfinished by a run with the same settings is finished, one that
+            is damaged is mended, with a `StoreWarning` that says what was wrong; what is returned is opened lazily.
         name: of the quantity in the store, needed where it is a lambda or a closure.
         progress: called with cells done, cells in all, and steps taken by this call, after every piece of work.
+        announce: called with the `Cost` of what is to be computed, before it is.
+        most_steps: refuse what would take more steps in all, or more than a millionth of it in one motion, because
+            these follow one another. The steps are known from the quantity's setting `duration`; of a quantity without
+            one the first cells tell.
     Returns:
         xarray.Dataset: the quantity's values, `status` (a value of `Status` for each cell: NONFINITE where a value is
         NaN), coordinates with units, angles also in degrees, and as attributes all that determines the values.
     Raises:
-        ValueError: bad axes, tolerance or method; a store made with other settings, or a directory that is none; no
-            directory to write a store in.
+        ValueError: bad axes, tolerance or method; a store made with other settings, or a directory that is none; a
+            store that another process is writing, or that cannot be written; more than `most_steps`, or than the
+            memory holds.
         RuntimeError: a store made by another version of this package; float64 is switched off in JAX.
     """
     require_float64()
-    grid = _Grid.checked(pendulum, axes, at or {})
+    example = "functools.partial(dpend.chaos.lyapunov, duration=10.0)"
+    function("quantity", quantity, "(pendulum, state, scheme)", example)
+    keyed = _Keyed.of(quantity)
+    grid = _Grid.checked(pendulum, axes, {} if at is None else at)
+    most = known_number("most_steps", most_steps, positive=True)
+    if most > _COUNTABLE:
+        raise ValueError(f"most_steps must be at most {_COUNTABLE:g}, got {most:g}: give fewer")
     scheme = _scheme(grid, tolerance, method, step)
-    if error not in (None, "half-step"):
-        raise ValueError(f'error must be None or "half-step", got {error!r}')
-    task = _Task(_Keyed.of(quantity), grid, scheme, error is not None, mirror)
-    _kinds(task)  # refuses a quantity that cannot be mapped before anything is computed
-    if store is None:
-        return _labelled(task, _computed(task, progress), task.attributes(name, strict=False))
-    return _stored(task, Path(store), task.attributes(name, strict=True), progress)
+    if not (error is None or (isinstance(error, str) and error == "half-step")):
+        raise ValueError(f'error must be None or "half-step", got {shown(error)}: give one of them')
+    mirror = flag("mirror", mirror)
+    place = None if store is None else file_path("store", store)
+    name = None if name is None else text("name", name)
+    if progress is not None:
+        function("progress", progress, "(cells done, cells in all, steps)", "print")
+    if announce is not None:
+        function("announce", announce, "a Cost", "print")
+    work = _Work(_Task(keyed, grid, scheme, error is not None, mirror), most)
+    work.tell, work.announce = progress, announce
+    if place is None:
+        return _labelled(work.task, _computed(work), work.task.attributes(name, strict=False))
+    return _stored(work, place, work.task.attributes(name, strict=True))
 
 
 # --- what is asked ---------------------------------------------------------------------------------------------------
@@ -124,9 +159,19 @@ class _Keyed:
 
     @staticmethod
     def of(quantity: Quantity) -> "_Keyed":
+        if not callable(quantity):
+            raise ValueError(f"quantity must be a function, got {quantity!r}: give one of dpend.chaos, or your own")
         if not isinstance(quantity, partial):
             return _Keyed(quantity, (), ())
-        return _Keyed(quantity.func, quantity.args, tuple(sorted(quantity.keywords.items())))
+        keyed = _Keyed(quantity.func, quantity.args, tuple(sorted(quantity.keywords.items())))
+        try:
+            hash(keyed)
+        except TypeError:
+            raise ValueError(
+                f"quantity must have settings that can be hashed, got {shown(quantity.keywords)}: "
+                "give a tuple for a list"
+            ) from None
+        return keyed
 
     def __call__(self, *args: Any) -> Mapping[str, Scalar]:
         return self.function(*self.arguments, *args, **dict(self.keywords))
@@ -139,9 +184,18 @@ class _Keyed:
         """
         inner = inspect.unwrap(self.function)
         own = getattr(inner, "__qualname__", type(inner).__qualname__)
-        nameless = "<" in own or getattr(inner, "__closure__", None)
-        if strict and nameless and name is None:
-            raise ValueError(f"name must be given to store a lambda or a closure, got {own}: say what it computes")
+        try:
+            source = inspect.getsource(inner)
+        except (OSError, TypeError):
+            source = ""
+        if strict and name is None:
+            if "<" in own or getattr(inner, "__closure__", None):
+                raise ValueError(f"name must be given to store a lambda or a closure, got {own}: say what it computes")
+            if not inspect.isfunction(inner) or not source:  # two of them would look alike
+                raise ValueError(
+                    f"name must be given to store a quantity that is no function in a file, got {own}: say what it "
+                    "computes"
+                )
         try:
             settings = json.dumps([self.arguments, dict(self.keywords)], allow_nan=False)
         except (TypeError, ValueError):
@@ -151,10 +205,6 @@ class _Keyed:
                     f"got {dict(self.keywords)}: say what it computes"
                 ) from None
             settings = "see the name"
-        try:
-            source = inspect.getsource(inner)
-        except (OSError, TypeError):
-            source = ""
         return {
             "quantity": name or f"{getattr(inner, '__module__', '')}.{own}",
             "quantity_settings": settings,
@@ -171,27 +221,37 @@ class _Grid:
     at: dict[str, float]
 
     @staticmethod
-    def checked(pendulum: Pendulum, axes: Mapping[str, Any], at: Mapping[str, float]) -> "_Grid":
+    def checked(pendulum: Pendulum | Any, axes: Mapping[str, Any] | Any, at: Mapping[str, float] | Any) -> "_Grid":
+        if isinstance(pendulum, Pendulum) and any(np.ndim(leaf) for leaf in vars(pendulum).values()):
+            raise ValueError("pendulum must have numbers for fields, got arrays: name those that vary as axes")
+        pendulum = known_pendulum(pendulum)
+        for name, given in (("axes", axes), ("at", at)):
+            if not isinstance(given, Mapping):
+                raise ValueError(
+                    f"{name} must be a dictionary by field, got {shown(given)}: give one like {{'p1': 0.1}}"
+                )
         if not 1 <= len(axes) <= 2:
-            raise ValueError(f"axes must be one or two, got {len(axes)}: {list(axes)}")
+            raise ValueError(f"axes must be one or two, got {len(axes)}: give one like {{'theta1': angles}}")
         for key in [*axes, *at]:
             if key not in _STATE + _PENDULUM:
-                raise ValueError(f"axes and at must be fields of State or Pendulum, got {key!r}: {', '.join(_UNITS)}")
+                known = ", ".join(_STATE + _PENDULUM)
+                raise ValueError(f"axes and at must be fields of State or Pendulum, got {key!r}: give one of {known}")
         twice = [key for key in at if key in axes or key in _PENDULUM]
         if twice:
             raise ValueError(f"at must name fields of State that are no axis, got {twice[0]!r}: leave it out")
         values = {}
         for key, given in axes.items():
-            array = np.asarray(given, np.float64)
+            array = numbers(f"axis {key}", given)
             if array.ndim != 1 or not array.size or not np.all(np.isfinite(array)):
-                raise ValueError(f"axis {key} must be a one-dimensional array of finite numbers, got {given!r}")
+                raise ValueError(
+                    f"axis {key} must be a one-dimensional array of finite numbers, got {shown(given)}: "
+                    "give other values"
+                )
             if key in ("l1", "l2", "m1", "m2") and np.any(array <= 0):
                 raise ValueError(f"axis {key} must be positive, got {array.min():g}: leave that out")
             values[key] = array
-        if not all(isinstance(getattr(pendulum, field), np.floating) for field in _PENDULUM):
-            raise ValueError("pendulum must have numbers for fields: name those that vary as axes")
         rest = {field: 0.0 for field in _STATE if field not in values}
-        return _Grid(pendulum, values, rest | {key: float(number(key, value)) for key, value in at.items()})
+        return _Grid(pendulum, values, rest | {key: known_number(key, value) for key, value in at.items()})
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -309,25 +369,137 @@ class _Task:
             "mirror": "where it holds" if self.mirror else "never",
             "axes_sha256": axes.hexdigest(),
             "tile": list(self.grid.tile()),
+            "digests": "sha256",
         }
 
 
-def _scheme(grid: _Grid, tolerance: float | None, method: str | None, step: float | None) -> Scheme:
+def _scheme(grid: _Grid, tolerance: Any, method: Any, step: Any) -> Scheme:
     if method is None and step is None:
-        wanted = float(number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad"))
+        wanted = known_number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad")
         ends = {key: (array.min(), array.max()) for key, array in grid.axes.items() if key in _PENDULUM}
         corners = np.array(np.meshgrid(*ends.values())).reshape(len(ends), -1).T if ends else [()]
-        schemes = [
-            scheme_for(replace(grid.pendulum, **dict(zip(ends, map(float, corner), strict=True))), wanted)
-            for corner in corners
-        ]
+        pendulums = [replace(grid.pendulum, **dict(zip(ends, map(float, corner), strict=True))) for corner in corners]
+        # Without gravity nothing sets a time: the others do, as they do where zero lies between the ends.
+        schemes = [scheme_for(one, wanted) for one in [one for one in pendulums if one.g] or pendulums]
         return min(schemes, key=lambda scheme: scheme.step)  # the fastest pendulum's
     if tolerance is not None:
-        raise ValueError(f"tolerance excludes method and step, got {tolerance}: give either")
+        raise ValueError(f"tolerance excludes method and step, got {shown(tolerance)}: give either")
     if method is None or step is None:
         given, missing = ("step", "method") if method is None else ("method", "step")
         raise ValueError(f"{missing} must be given with {given}, got {given} alone: or give a tolerance")
     return Scheme(method, step)
+
+
+# --- what it costs ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cost:
+    """About what a sweep takes.
+
+    Attributes:
+        cells: to be computed, not mirrored.
+        each: steps of one motion, both passes; the mean where steps are uneven, of which one motion may take five times
+            as many; None where nothing is known of the motion.
+        bytes: of the values of all cells, before they are compressed.
+    """
+
+    cells: int
+    each: float | None
+    bytes: int
+
+    @property
+    def steps(self) -> float:
+        """Of all cells."""
+        return self.cells * (self.each or 0.0)
+
+    @property
+    def seconds(self) -> float:
+        """A first guess, at the speed of one machine's cores."""
+        cores = jax.local_device_count()
+        lanes = max(self.cells, WIDTH * cores) if self.cells else 0
+        return lanes * (self.each or 0.0) / (cores * _RATE)
+
+
+def _motion_steps(task: _Task) -> float | None:
+    """About how many steps a motion takes, from the quantity's setting `duration`."""
+    duration = dict(task.quantity.keywords).get("duration")
+    if not isinstance(duration, Real) or isinstance(duration, bool) or not math.isfinite(duration):
+        return None
+    steps = max(1.0, abs(float(duration)) / task.scheme.step) * (3 if task.twice else 1)
+    if not task.scheme.even:
+        steps *= _UNEVEN
+    momenta = any(key in task.grid.axes or task.grid.at.get(key) for key in ("p1", "p2"))
+    # A release from rest gets hardly faster than the fast mode; a motion under way may start with short steps.
+    return steps if task.scheme.even or not momenta else steps * _shortening(task)
+
+
+def _shortening(task: _Task) -> float:
+    """By how much the scheme's step is cut at the start of the fastest of some cells."""
+    ends = [array[np.linspace(0, array.size - 1, 8).astype(int)] for array in task.grid.axes.values()]
+    cells = {key: mesh.ravel() for key, mesh in zip(task.grid.axes, np.meshgrid(*ends), strict=True)}
+    shorter = np.asarray(_cut(task.scheme, *task.shared, cells))
+    return float(np.max(shorter[shorter < _LOST], initial=1.0))
+
+
+@partial(jax.jit, static_argnums=0)
+def _cut(scheme: Scheme, pendulum: Pendulum, at: dict[str, Scalar], cells: dict[str, Scalar]) -> Scalar:
+    def one(cell: dict[str, Scalar]) -> Scalar:
+        here, state = _placed(pendulum, at, cell)
+        spin = scheme.spin(scheme.constants(here), scheme.enter(here, state))
+        return jax.numpy.maximum(spin, 1.0) ** 0.75
+
+    return jax.vmap(one)(cells)
+
+
+class _Work:
+    """A sweep under way: what it may cost, and how far it is."""
+
+    def __init__(self, task: _Task, most_steps: float):
+        self.task, self.most_steps = task, most_steps
+        self.tell: Callable[[int, int, int], None] | None = None
+        self.announce: Callable[[Cost], None] | None = None
+        self.cells, self.steps, self.all = 0, 0, math.prod(task.grid.shape)
+        self.cost = Cost(1, _motion_steps(task), 0)
+        self._check(most_steps)  # before the motion is traced: JAX cannot count so far
+        self.kinds = _kinds(task)  # refuses a quantity that cannot be mapped before anything is computed
+
+    def price(self, done: int) -> None:
+        """Refuses what costs too much where so many cells are done."""
+        mirrored = self.task.mirror and self.task.grid.symmetric
+        cells = max(-(-self.all // 2) - done, 0) if mirrored else self.all - done
+        self.cost = Cost(cells, self.cost.each, self.all * sum(kind.itemsize for kind in self.kinds.values()))
+        self._check(self.most_steps * _SHARE)
+
+    def begin(self, done: int) -> None:
+        """Tells what it costs where so many cells are done."""
+        self.price(done)
+        if self.announce is not None:
+            self.announce(self.cost)
+        self.count(done, 0)
+
+    def count(self, cells: int, steps: int) -> None:
+        first, self.cells, self.steps = not self.steps, self.cells + cells, self.steps + steps
+        if self.tell is not None:
+            self.tell(self.cells, self.all, self.steps)
+        if first and steps and self.cost.each is None:
+            self.cost = replace(self.cost, each=steps / cells)
+            self._check(self.most_steps * _SHARE)
+
+    def _check(self, longest: float) -> None:
+        cost, most = self.cost, self.most_steps
+        each = cost.each or 0.0
+        if not cost.cells or (each <= longest and cost.steps <= most):
+            return
+        duration = dict(self.task.quantity.keywords).get("duration")
+        told = f"duration {duration:g} s, step" if isinstance(duration, Real) else "step"
+        needed = 1.01 * max(cost.steps, each / _SHARE)
+        more = f", or most_steps={needed:.3g}" if needed <= _COUNTABLE else ""
+        raise ValueError(
+            f"duration and step must leave at most {most * _SHARE:.3g} steps to one motion and {most:.3g} to all, got "
+            f"{told} {self.task.scheme.step:.3g} s, which make {each:.3g} and {max(cost.cells, 1) * each:.3g}: give a "
+            f"shorter duration, a larger step or fewer cells{more}"
+        )
 
 
 # --- computing -------------------------------------------------------------------------------------------------------
@@ -362,14 +534,17 @@ def _parities(task: _Task) -> dict[str, int] | None:
     return parities
 
 
-def _tile_values(  # type: ignore[no-untyped-def]
-    task: _Task, block: tuple[slice, ...], parities: dict[str, int] | None, done, progress
+def _tile_values(
+    work: "_Work",
+    block: tuple[slice, ...],
+    parities: dict[str, int] | None,
+    done: Callable[[tuple[slice, ...]], dict[str, np.ndarray]],
 ) -> dict[str, np.ndarray]:
     """The values and status of a tile's cells; done(block) gives those of any block so far."""
-    grid = task.grid
+    grid = work.task.grid
     shape = tuple(part.stop - part.start for part in block)
     if parities is None:
-        return _lane_values(task, block, np.ones(shape, bool), progress)
+        return _lane_values(work, block, np.ones(shape, bool))
     known = {key: grid.turned(array) for key, array in done(grid.reflected(block)).items()}
     fresh = known["status"] == Status.NOT_COMPUTED
     places = np.meshgrid(*(np.arange(part.start, part.stop) for part in block), indexing="ij")
@@ -380,7 +555,7 @@ def _tile_values(  # type: ignore[no-untyped-def]
     inside = np.all([(part.start <= im) & (im < part.stop) for part, im in zip(block, images, strict=True)], axis=0)
     later = np.ravel_multi_index(places, grid.shape) > np.ravel_multi_index(images, grid.shape)
     own_image = fresh & inside & later  # of a pair of images within the tile one is computed
-    values = _lane_values(task, block, fresh & ~own_image, progress)
+    values = _lane_values(work, block, fresh & ~own_image)
     source = tuple(im[own_image] - part.start for im, part in zip(images, block, strict=True))
     for key, array in values.items():
         parity = np.asarray(parities.get(key, 1), array.dtype)  # the status is even
@@ -389,8 +564,9 @@ def _tile_values(  # type: ignore[no-untyped-def]
     return values
 
 
-def _lane_values(task: _Task, block: tuple[slice, ...], compute: np.ndarray, progress: Any) -> dict[str, np.ndarray]:
+def _lane_values(work: "_Work", block: tuple[slice, ...], compute: np.ndarray) -> dict[str, np.ndarray]:
     """The values and status of the cells of a block that are to be computed, arrays of the block's shape."""
+    task = work.task
     every = task.grid.lanes(block)
     chosen = np.flatnonzero(compute)
     if not task.scheme.even:
@@ -399,9 +575,7 @@ def _lane_values(task: _Task, block: tuple[slice, ...], compute: np.ndarray, pro
         chosen = chosen[np.argsort(energy[chosen], kind="stable")]
     values: dict[str, np.ndarray] = {}
     at = 0
-    for piece in (
-        launches(task.cell, task.shared, {key: lanes[chosen] for key, lanes in every.items()}) if chosen.size else ()
-    ):
+    for piece in _pieces(work, {key: lanes[chosen] for key, lanes in every.items()}):
         taken = int(piece.pop(_TAKEN).sum())
         own = piece.pop("status", None)
         bad = np.any([np.isnan(array) for array in piece.values() if array.dtype.kind == "f"], axis=0)
@@ -410,8 +584,18 @@ def _lane_values(task: _Task, block: tuple[slice, ...], compute: np.ndarray, pro
         for key, array in piece.items():
             values.setdefault(key, np.zeros(compute.shape, array.dtype)).ravel()[chosen[at : at + count]] = array
         at += count
-        progress(count, taken)
+        work.count(count, taken)
     return values or {key: np.zeros(compute.shape, kind) for key, kind in _kinds(task).items()}
+
+
+def _pieces(work: "_Work", lanes: dict[str, np.ndarray]) -> Iterator[dict[str, np.ndarray]]:
+    """The results of lanes as they come, of the first few soon: they tell how long the rest takes."""
+    task, first = work.task, WIDTH * jax.local_device_count()
+    parts = [slice(None)] if work.steps else [slice(None, first), slice(first, None)]
+    for part in parts:
+        some = {key: array[part] for key, array in lanes.items()}
+        if next(iter(some.values())).size:
+            yield from launches(task.cell, task.shared, some, work.cost.each or 1.0)
 
 
 def _kinds(task: _Task) -> dict[str, np.dtype]:
@@ -435,32 +619,42 @@ def _kinds(task: _Task) -> dict[str, np.dtype]:
     return {key: np.dtype(kind.dtype) for key, kind in kinds.items()} | {"status": np.dtype(np.uint8)}
 
 
-class _Progress:
-    """Counts cells and steps, and tells the caller."""
-
-    def __init__(self, task: _Task, tell: Callable[[int, int, int], None] | None):
-        self.cells, self.steps, self.all, self.tell = 0, 0, int(np.prod(task.grid.shape)), tell
-
-    def __call__(self, cells: int, steps: int) -> None:
-        self.cells, self.steps = self.cells + cells, self.steps + steps
-        if self.tell is not None:
-            self.tell(self.cells, self.all, self.steps)
-
-
-def _computed(task: _Task, tell: Callable[[int, int, int], None] | None) -> dict[str, np.ndarray]:
+def _computed(work: _Work) -> dict[str, np.ndarray]:
     """All values in memory."""
-    progress, parities = _Progress(task, tell), _parities(task)
-    values = {key: np.zeros(task.grid.shape, kind) for key, kind in _kinds(task).items()}
+    grid = work.task.grid
+    work.price(0)
+    _check_memory(work.cost.bytes)
+    work.begin(0)
+    values = {key: np.zeros(grid.shape, kind) for key, kind in work.kinds.items()}
     values["status"][...] = Status.NOT_COMPUTED
-    for block in task.grid.tiles():
-        before = progress.cells
-        tile = _tile_values(
-            task, block, parities, lambda image: {key: array[image] for key, array in values.items()}, progress
-        )
+    parities = _parities(work.task)
+    for block in grid.tiles():
+        tile = _whole_tile(work, block, parities, lambda image: {key: array[image] for key, array in values.items()})
         for key, array in tile.items():
             values[key][block] = array
-        progress(tile["status"].size - (progress.cells - before), 0)
     return values
+
+
+def _check_memory(size: int) -> None:
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if size > memory:
+        raise ValueError(
+            f"axes must leave values that the memory holds, got {size / 1e9:.3g} GB for {memory / 1e9:.3g} GB: give a "
+            "store, or fewer cells"
+        )
+
+
+def _whole_tile(
+    work: _Work,
+    block: tuple[slice, ...],
+    parities: dict[str, int] | None,
+    done: Callable[[tuple[slice, ...]], dict[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """A tile's values, and its mirrored cells counted too."""
+    before = work.cells
+    tile = _tile_values(work, block, parities, done)
+    work.count(tile["status"].size - (work.cells - before), 0)
+    return tile
 
 
 def _coordinates(grid: _Grid) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
@@ -490,135 +684,109 @@ def _labelled(task: _Task, values: dict[str, np.ndarray], attributes: dict[str, 
 # --- the store -------------------------------------------------------------------------------------------------------
 
 
-def check_store(name: str, path: Path) -> None:
-    """Refuses, before anything is computed, a path where there is no store and none could be made.
-
-    Raises:
-        ValueError: something else is there, or no directory to write in. `name` is the argument that is told.
-    """
-    if os.path.exists(path):
-        _attributes(name, path)
-    elif reason := unwritable(path):
-        raise ValueError(
-            f"{name} must be a new name in a directory that can be written to, got {path} ({reason}): "
-            "give another place"
-        )
-
-
-def _stored(task: _Task, path: Path, attributes: dict[str, Any], tell: Callable[[int, int, int], None] | None) -> Any:
-    import xarray
-    import zarr
-
+def _stored(work: _Work, path: Path, attributes: dict[str, Any]) -> Any:
     check_store("store", path)
-    if not path.exists():
-        _create(task, path, attributes)
-    _check(path, attributes)
-    # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
-    arrays = {
-        key: zarr.open_array(path / key, mode="r+").with_config({"write_empty_chunks": True}) for key in _kinds(task)
+    store, grid = _store(work, path, attributes), work.task.grid
+    blocks = dict(zip(store.tiles, grid.tiles(), strict=True))
+    if not os.path.lexists(path):
+        work.price(0)
+        store.create()
+    store.check()
+    if store.inspect().whole:  # a finished one is only read
+        work.count(work.all, 0)
+        return store.open()
+    with store.lock():
+        findings = store.inspect()  # once more: who held the lock may have gone on
+        if findings.damage:
+            warnings.warn(findings.sentence(store), StoreWarning, stacklevel=3)
+        todo = {tile: blocks[tile] for tile in findings.todo}
+        done = work.all - sum(_size(block) for block in todo.values())
+        work.begin(done)
+        store.repair(findings)
+        _fill(work, store, todo)
+    return store.open()
+
+
+def _size(block: tuple[slice, ...]) -> int:
+    return math.prod(part.stop - part.start for part in block)
+
+
+def _fill(work: _Work, store: Store, todo: dict[tuple[int, ...], tuple[slice, ...]]) -> None:
+    """Computes tiles and writes each once it is whole."""
+    parities = _parities(work.task) if todo else None
+    arrays = {key: store.array(key) for key in work.kinds}
+    for tile, block in todo.items():
+        values = _whole_tile(work, block, parities, lambda image: {key: array[image] for key, array in arrays.items()})
+        store.write(tile, block, values)
+
+
+def _store(work: _Work, path: Path, attributes: dict[str, Any]) -> Store:
+    """What the store of a sweep should hold."""
+    memory: dict[str, Any] = {}  # the files of an empty store, as Zarr writes them
+    arrays = _lay(work, attributes, memory)
+    files = _consolidated({name: buffer.to_bytes() for name, buffer in memory.items()})
+
+    def encode(name: str, block: tuple[slice, ...], values: np.ndarray) -> bytes:
+        arrays[name.partition("/")[0]][block] = values
+        return bytes(memory.pop(name).to_bytes())
+
+    sides = work.task.grid.tile()
+    counts = [-(-size // side) for size, side in zip(work.task.grid.shape, sides, strict=True)]
+    return Store(
+        path=path,
+        attributes=attributes,
+        documents={name: text for name, text in files.items() if name.endswith("zarr.json")},
+        coordinates={name: text for name, text in files.items() if not name.endswith("zarr.json")},
+        arrays={key: math.prod(sides) * kind.itemsize for key, kind in work.kinds.items()},
+        tiles=list(np.ndindex(*counts)),
+        encode=encode,
+    )
+
+
+def _lay(work: _Work, attributes: dict[str, Any], memory: dict[str, Any]) -> dict[str, Any]:
+    """An empty store in `memory`; the arrays that are computed. Each chunk ends in a checksum for any reader."""
+    import zarr
+    from zarr.codecs import Crc32cCodec, ZstdCodec
+    from zarr.storage import MemoryStore
+
+    grid = work.task.grid
+    degrees = " ".join(key for key in _coordinates(grid) if key not in grid.axes)
+    group: Any = zarr.create_group(MemoryStore(memory), attributes=attributes | {_DEGREES: degrees})
+    for key, (dim, values, units) in _coordinates(grid).items():
+        array = group.create_array(
+            key,
+            shape=values.shape,
+            dtype=values.dtype,
+            chunks=values.shape,
+            dimension_names=[dim],
+            attributes=units,
+            compressors=[Crc32cCodec()],  # not compressed: compressors of other versions may give other bytes
+        )
+        array[...] = values
+    return {
+        key: group.create_array(
+            key,
+            shape=grid.shape,
+            dtype=kind,
+            chunks=grid.tile(),
+            dimension_names=list(grid.axes),
+            fill_value=int(Status.NOT_COMPUTED) if key == "status" else (math.nan if kind.kind == "f" else 0),
+            attributes=_units(key),
+            compressors=[ZstdCodec(level=0, checksum=False), Crc32cCodec()],
+            # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
+            config={"write_empty_chunks": True},
+        )
+        for key, kind in work.kinds.items()
     }
-    progress = _Progress(task, tell)
-    todo = []
-    for block in task.grid.tiles():
-        if np.all(arrays["status"][block] != Status.NOT_COMPUTED):
-            progress.cells += int(np.prod([part.stop - part.start for part in block]))
-        else:
-            todo.append(block)
-    if todo and not os.access(path, os.W_OK):  # a finished one is only read
-        raise ValueError(f"store must be finished or one that can be written to, got {path}: finish a copy of it")
-    for leftover in path.rglob("*.partial") if todo else ():  # of a process that was killed while it wrote
-        leftover.unlink()
-    parities = _parities(task) if todo else None
-    for block in todo:
-        before = progress.cells
-        tile = _tile_values(
-            task, block, parities, lambda image: {key: array[image] for key, array in arrays.items()}, progress
-        )
-        for key in sorted(tile, key=lambda key: key == "status"):  # the status last
-            _write(path / key, arrays[key], block, tile[key])
-        progress(tile["status"].size - (progress.cells - before), 0)
-    return xarray.open_zarr(path, consolidated=False, chunks=None)
 
 
-def _write(path: Path, array: Any, block: tuple[slice, ...], values: np.ndarray) -> None:
-    """Writes one chunk and waits until it is on the disk."""
-    array[block] = values
-    chunk = tuple(part.start // side for part, side in zip(block, array.chunks, strict=True))
-    file = path / array.metadata.encode_chunk_key(chunk)
-    for place in (file, *list(file.parents)[: len(chunk) + 1]):
-        _sync(place)
-
-
-def _sync(place: Path) -> None:
-    handle = os.open(place, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _create(task: _Task, path: Path, attributes: dict[str, Any]) -> None:
-    """An empty store, under a temporary name until it is whole."""
-    import zarr
-
-    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-    try:
-        grid = task.grid
-        degrees = " ".join(key for key in _coordinates(grid) if key not in grid.axes)
-        group: Any = zarr.create_group(draft, attributes=attributes | {_DEGREES: degrees})
-        for key, (dim, values, units) in _coordinates(grid).items():
-            array = group.create_array(
-                key,
-                shape=values.shape,
-                dtype=values.dtype,
-                chunks=values.shape,
-                dimension_names=[dim],
-                attributes=units,
-            )
-            array[...] = values
-        for key, kind in _kinds(task).items():
-            group.create_array(
-                key,
-                shape=grid.shape,
-                dtype=kind,
-                chunks=grid.tile(),
-                dimension_names=list(grid.axes),
-                fill_value=int(Status.NOT_COMPUTED) if key == "status" else (math.nan if kind.kind == "f" else 0),
-                attributes=_units(key),
-            )
-        for place in (*draft.rglob("*"), draft):
-            _sync(place)
-        os.rename(draft, path)
-        _sync(path.parent)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def _attributes(name: str, path: Path) -> dict[str, Any]:
-    """A store's attributes; raises as `check_store` does."""
-    import zarr
-
-    try:
-        return dict(zarr.open_group(path, mode="r").attrs)
-    except (FileNotFoundError, ValueError, KeyError, NotADirectoryError):
-        raise ValueError(
-            f"{name} must be a Zarr store of a sweep or a new name, got {path}: give another name"
-        ) from None
-
-
-def _check(path: Path, attributes: dict[str, Any]) -> None:
-    """Refuses a store of another sweep."""
-    found = _attributes("store", path)
-    if found.get("dpend_version") != attributes["dpend_version"]:
-        raise RuntimeError(
-            f"store {path} was made by version {found.get('dpend_version')} of dpend, this is "
-            f"{attributes['dpend_version']}: finish it with that version, or give another name"
-        )
-    wanted = json.loads(json.dumps(attributes))
-    found.pop(_DEGREES, None)
-    for key in {**wanted, **found}:
-        if found.get(key) != wanted.get(key):
-            raise ValueError(
-                f"store {path} holds another sweep, its {key} is {found.get(key)!r}, not {wanted.get(key)!r}: "
-                "give another name"
-            )
+def _consolidated(files: dict[str, bytes]) -> dict[str, bytes]:
+    """The files with the metadata of all arrays in the group's too, where xarray looks for it first."""
+    inside = {
+        name.removesuffix("/zarr.json"): json.loads(text)
+        for name, text in sorted(files.items())
+        if name.endswith("/zarr.json")
+    }
+    group = json.loads(files["zarr.json"])
+    group["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": inside}
+    return files | {"zarr.json": json.dumps(group, indent=2).encode()}

@@ -167,9 +167,10 @@ class _Linear(NamedTuple):
     by_logs: np.ndarray  # (K - 1, 4, 3)
     corner: np.ndarray  # (F, F), of the cost with respect to the fields
     slope: np.ndarray  # (F,)
+    within: bool  # whether the fields are in the range that a pendulum is sought in
 
     def cost(self, price: np.ndarray) -> float:
-        return self.misses.cost(price) + self.extra
+        return self.misses.cost(price) + self.extra if self.within else math.inf
 
 
 def _linear(problem: Problem, point: Point, steps: int, prior: float = 0.0) -> _Linear:
@@ -193,7 +194,8 @@ def _linear(problem: Problem, point: Point, steps: int, prior: float = 0.0) -> _
     normal[0, :, :4] *= free
     normal[0, :4, :4] += np.diag(1.0 - free)
     gradient[0, :4] *= free
-    return _Linear(misses, prior * float(fields @ fields), normal, gradient, by_node, by_logs, corner, slope)
+    within = bool(np.all(np.abs(fields) <= _FARTHEST))
+    return _Linear(misses, prior * float(fields @ fields), normal, gradient, by_node, by_logs, corner, slope, within)
 
 
 # --- one iteration ---------------------------------------------------------------------------------------------------
@@ -280,6 +282,8 @@ PRICES = (0.3, 0.03, 0.003)
 # In these rounds it costs as much as a residual of the noise's size to take a field's logarithm this far from its
 # start: what the data say weighs more, where they do; the last iterations do without.
 _FAR = 0.5
+# A field that is a thousand million times its start is not what was measured; e^700 would be no double.
+_FARTHEST = math.log(1e9)
 _MOST_TRIALS, _MOST_ITERATIONS = 25, 25
 # A round is over when an iteration that is damped by no more than the second gains less than the first, of the cost.
 _LITTLE, _FREELY = 0.1, 1e-2
@@ -454,6 +458,7 @@ def settings_for(
     nodes = np.where(blind, np.array([0.0, 0.5 * np.pi, 3 * rate, -3 * rate])[:, None], nodes)
     fast = float(np.max(np.asarray(fastest(pendulum, momenta(pendulum, *nodes)))))
     turn = float(np.max(problem.dts)) * fast
+    turn = turn if math.isfinite(turn) else math.inf
     rough, fine = (math.ceil(min(max(turn / share, 1.0), _MOST_STEPS)) for share in (_ROUGH, _FINE))
     return Settings(rate, noise, (rough, fine))
 

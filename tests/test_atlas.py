@@ -10,14 +10,24 @@ from test_families import monodromy
 from test_scan import FORTY
 
 import dpend
-from dpend import Pendulum, Status
+from dpend import Pendulum, Status, atlas
 
 CATALOGUE = Path(__file__).parent.parent / "experiments" / "atlas"
 
 
 @pytest.fixture(scope="module")
-def forty(paper):
-    return dpend.find_brake_orbits(paper, theta1=np.radians(40.0), max_period=2.0)
+def forty_and_steps(paper):
+    """The orbits of forty degrees, and what the search told on its way."""
+    told = []
+    found = dpend.find_brake_orbits(
+        paper, theta1=np.radians(40.0), max_period=2.0, progress=lambda *steps: told.append(steps)
+    )
+    return found, told
+
+
+@pytest.fixture(scope="module")
+def forty(forty_and_steps):
+    return forty_and_steps[0]
 
 
 def test_the_eight_orbits_of_forty_degrees(forty):
@@ -114,6 +124,7 @@ def test_filters(forty):
     assert len(forty.where(symmetry="brake", period=(1.0, 1.5))) == 2
     assert np.all(np.abs(forty.where(kappa=(-1, 1)).table["kappa"]) <= 1)
     assert len(forty.where(energy=(-1.0, np.median(forty.table["energy"])))) == 4
+    assert len(forty.where(kappa=(-np.inf, np.inf))) == len(forty)
     nothing = forty.where(period=(3, 4))
     assert (len(nothing), nothing.orbits) == (0, ())
     assert len(nothing.where(symmetry="brake")) == 0
@@ -123,6 +134,11 @@ def test_filters(forty):
         ({"symmetry": "odd"}, "symmetry must be one of brake, centred"),
         ({"family": ["C1"]}, "family must be one of none"),
         ({"symmetry": 3}, "symmetry must be one of"),
+        ({"symmetry": [["brake"]]}, "symmetry must be one of"),
+        ({"period": (np.nan, 2)}, "period must be a pair"),
+        ({"period": (1, np.nan)}, "period must be a pair"),
+        ({"period": "12"}, "period must be a pair"),
+        ({"energy": (None, 1)}, "energy must be a pair"),
     ):
         with pytest.raises(ValueError, match=text):
             forty.where(**wrong)
@@ -165,6 +181,66 @@ def test_traced_requests_are_refused(paper):
         jax.jit(lambda x: dpend.find_brake_orbits(paper, theta1=x, max_period=1.0).table["period"][0])(1.0)
 
 
+@pytest.mark.parametrize(
+    ("pendulum", "request_", "said"),
+    [
+        (Pendulum(), {"theta1": 1e300}, r"theta1 must be at most 1.3e\+07 rad"),
+        (Pendulum(), {"max_period": 15.8}, "max_period must be so short that most_steps, 3e.08, are enough"),
+        (Pendulum(), {"most_steps": 1000}, "max_period must be so short that most_steps, 1000, are enough"),
+        (Pendulum(), {"most_steps": np.nan}, "most_steps must be a finite positive number"),
+        (Pendulum(), {"most_steps": True}, "most_steps must be a number"),
+        (Pendulum(m1=1e300), {}, "m1 and m2 must be within a factor of 1e30"),
+        (Pendulum(m2=1e-300), {}, "m1 and m2 must be within a factor of 1e30"),
+        (Pendulum(l2=1e-300), {}, "l1 and l2 must be within a factor of 1e12"),
+        (Pendulum(l1=1e-300), {"max_period": 1e9}, "l1 and l2 must be within a factor of 1e12"),
+        (Pendulum(g=1e300), {}, r"sqrt\(l1/g\) must be within 1e-90 and 1e90"),
+        (Pendulum(1e-200, 1e-200, 1.0, 1.0, 1e-200), {}, "m1 g l1 must be within"),
+        (Pendulum(m2=1e6), {}, "max_period must be at most 0.006542 s"),
+        (Pendulum(l2=1e-6), {}, "max_period must be at most 0.04626 s"),
+    ],
+)
+def test_what_would_never_end_is_refused(pendulum, request_, said):
+    with pytest.raises(ValueError, match=said):
+        dpend.find_brake_orbits(pendulum, **{"theta1": 1.0, "max_period": 1.0} | request_)
+
+
+def test_a_search_out_of_steps_ends_and_says_so(paper, forty_and_steps):
+    """It lists what it has: no other orbits than the whole search, and not without a doubt."""
+    whole, told = forty_and_steps
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(atlas, "expected_steps", lambda *_: 1)
+        request = {"theta1": np.radians(40.0), "max_period": 2.0, "most_steps": told[-1][0] // 4}
+        some = dpend.find_brake_orbits(paper, **request)
+    assert (whole.coverage.exhausted, some.coverage.exhausted) == (False, True)
+    assert some.coverage.suspicious_cells > 0
+    assert set(some.table["theta2"].tolist()) <= set(whole.table["theta2"].tolist())
+
+
+def test_the_cost_is_told_before_it_is_spent(forty_and_steps):
+    """To a factor of two, and every step on the way."""
+    done, planned = np.array(forty_and_steps[1]).T
+    assert done[0] == 0
+    assert done[-1] / 2 < planned[0] < 2 * done[-1]
+    assert np.all(np.diff(done) >= 0)
+    assert np.all(done <= planned)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("pendulum", "theta1", "max_period"),
+    [((0.2, 0.2, 0.1, 0.1, 9.8), 1.0, 3.0), ((1.0, 0.5, 3.0, 1.0, 9.81), 1.57, 6.0)],
+)
+def test_other_costs_are_told_before_they_are_spent(pendulum, theta1, max_period):
+    """To a factor of three."""
+    told = []
+    dpend.find_brake_orbits(
+        Pendulum(*pendulum), theta1=theta1, max_period=max_period, progress=lambda *steps: told.append(steps)
+    )
+    first, last = told[0], told[-1]
+    assert first[0] == 0
+    assert last[0] / 3 < first[1] < 3 * last[0]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("theta1", [1e-9, -1e-6])
 def test_tiny_swings(paper, theta1):
@@ -190,13 +266,13 @@ def test_files_that_are_no_atlas(forty, tmp_path):
 
 def test_the_published_catalogue(paper):
     """Both files hold the same orbits; a few of each family are solved again from their digits."""
-    atlas, same = (dpend.load_atlas(CATALOGUE / f"brake_orbits.{ending}") for ending in ("csv", "json"))
-    assert [one["family"] for one in atlas.families if one["symmetry"] == "brake"] == [f"B{i}" for i in range(1, 7)]
-    assert (atlas.coverage.suspicious_cells, atlas.coverage.degree) == (0, atlas.coverage.winding)
-    for key, column in atlas.table.items():
+    published, same = (dpend.load_atlas(CATALOGUE / f"brake_orbits.{ending}") for ending in ("csv", "json"))
+    assert [one["family"] for one in published.families if one["symmetry"] == "brake"] == [f"B{i}" for i in range(1, 7)]
+    assert (published.coverage.suspicious_cells, published.coverage.degree) == (0, published.coverage.winding)
+    for key, column in published.table.items():
         np.testing.assert_array_equal(column, same.table[key])
-    for one in atlas.families:
-        for orbit in atlas.where(family=one["family"]).orbits[5::45]:
+    for one in published.families:
+        for orbit in published.where(family=one["family"]).orbits[5::45]:
             again = dpend.find_orbit(paper, orbit.theta1, guess=(orbit.theta2, orbit.period))
             found = [again.theta2, again.period, again.dual.theta1, again.dual.theta2, again.energy]
             known = [orbit.theta2, orbit.period, orbit.dual.theta1, orbit.dual.theta2, orbit.energy]

@@ -1,6 +1,7 @@
 """Crossings against closed forms, another integrator, and the method's own order."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -106,3 +107,50 @@ def test_tiny_values_cross_where_they_cross(paper):
     )
     plain = dpend.first_crossing(lower, paper, dpend.released(0.5, 0.5), 1.0, Scheme("rk8-circle", 0.02))
     assert abs(found.time - plain.time) < 1e-12
+
+
+FORTY = math.radians(40.0)
+
+
+def turn_of(pendulum, start, scheme):
+    """Where theta1 turns back first, and when."""
+    crossing = dpend.first_crossing(rate1, pendulum, start, 1.0, scheme)
+    return float(crossing.state.theta1), float(crossing.time)
+
+
+def rate1(pendulum, state):
+    return dpend.velocities(pendulum, state)[0]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rk8-circle",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("rk4", "rk8", "rk8-circle-rescaled", "gauss")),
+    ],
+)
+def test_two_crossings_about_a_turn_inside_one_step(paper, name):
+    """Of theta1 = lowest + d, whose two crossings lie sqrt(2 d/acceleration) before and behind the turn: both are roots
+    to the last digits, in order, also in directions, and with nothing between them and the next swing.
+    """
+    scheme, start = Scheme(name, 1e-3 if name == "rk4" else 4e-3), dpend.released(FORTY, 0.85)
+    lowest, turn = turn_of(paper, start, scheme)
+    swing = dpend.first_crossing(rate1, paper, start, 1.0, scheme).state
+    bend = float(jax.jvp(lambda x: rate1(paper, x), (swing,), (dpend.vector_field(paper, swing),))[1])
+
+    @partial(jax.jit, static_argnames="direction")
+    def find(start, level, direction=0):
+        return dpend.first_crossing(lambda p, s: s.theta1 - level, paper, start, 0.9, scheme, direction=direction)
+
+    for depth in (1e-5, 1e-7, 1e-9):
+        level, apart = lowest + depth, math.sqrt(2 * depth / bend)
+        first = find(start, level)
+        assert abs(first.time - (turn - apart)) < 0.02 * apart
+        second = find(first.state, level)
+        assert abs(first.time + second.time - (turn + apart)) < 0.02 * apart
+        assert max(abs(first.state.theta1 - level), abs(second.state.theta1 - level)) < 4e-16
+        assert abs(find(start, level, -1).time - first.time) < 1e-12
+        assert abs(find(start, level, 1).time - first.time - second.time) < 1e-6 * apart
+        third = find(second.state, level)
+        assert third.time > 0.3
+    assert find(start, lowest - 1e-9).time == jnp.inf

@@ -1,5 +1,8 @@
 """Families against numbers computed elsewhere, linear theory, single shooting, other integrators and scaling laws."""
 
+import dataclasses
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +10,7 @@ import pytest
 
 import dpend
 from dpend import Pendulum, Status
-from dpend.stability import stability_of, transition
+from dpend.stability import growth_of, stability_of, transition
 
 # m = l = g = 1: where c - 1 and c change sign, theta1, theta2, T (None where only theta1 is known).
 SPECIAL = {
@@ -56,9 +59,9 @@ def motion(orbit):
 
 
 @jax.jit
-def monodromy(orbit, part):
-    """The derivative of the flow over `part` of the period, in one piece of 1600 steps."""
-    return transition(orbit.pendulum, orbit.state, part * orbit.period / 1600, 1600, dpend.Scheme("rk8", 1.0))[1]
+def monodromy(orbit, part, steps=1600):
+    """The derivative of the flow over `part` of the period, in one piece of so many steps."""
+    return transition(orbit.pendulum, orbit.state, part * orbit.period / steps, steps, dpend.Scheme("rk8", 1.0))[1]
 
 
 @pytest.mark.parametrize("branch", BOTH)
@@ -87,6 +90,133 @@ def test_reference_values_and_special_points(families, branch):
         assert abs(point.orbit.kappa - kappa) < 1e-10
 
 
+def says(kind):
+    """The kappa that a kind of special point stands for; None where it stands for none."""
+    if kind.startswith("stability"):
+        return 1.0
+    if not kind.startswith("resonance"):
+        return None
+    k, n = (int(text) for text in kind.removeprefix("resonance_").split(":"))
+    return np.cos(2 * np.pi * n / k)
+
+
+def assert_special_points_are_what_they_say(family):
+    """Of a centred family: kappa by shooting over the quarter period in one piece, signs between the neighbouring
+    orbits, and no point twice.
+    """
+    points, names = family.special_points, {point.kind for point in family.special_points}
+    for point in points:
+        where, error = (float(number) for number in point.error_estimate)
+        assert 0 < where < (0.1 if says(point.kind) is None else 1e-3), point.kind
+        if says(point.kind) is None:
+            continue
+        kappa, unsure = in_one_piece(point.orbit)
+        told = point.kind, where, error, float(point.orbit.kappa), kappa, unsure
+        assert error < 1e-2, told
+        assert abs(point.orbit.kappa - says(point.kind)) <= error, told
+        assert abs(kappa - says(point.kind)) <= error + unsure, told
+    for kind in names:
+        mine = [point for point in points if point.kind == kind]
+        for one, next_one in itertools.pairwise(mine):
+            apart = next_one.arclength - one.arclength
+            assert apart > one.error_estimate[0] + next_one.error_estimate[0], (kind, one.arclength)
+    for kind, slope in (("fold_theta1", family.slopes.theta1), ("fold_energy", family.slopes.energy)):
+        assert_signs_change(family, [p for p in points if p.kind == kind], slope / np.max(np.abs(slope)), 1e-12)
+    changes = [point for point in points if point.kind.startswith("stability")]
+    kinds = [point.kind for point in changes]
+    assert all(kind != other for kind, other in itertools.pairwise(kinds)), kinds
+    assert_signs_change(family, changes, 1 - np.asarray(family.orbits.kappa), 1e-9)
+    for first in changes[:1]:  # the others alternate
+        before = np.asarray(family.orbits.kappa)[family.arclength < first.arclength - first.error_estimate[0]]
+        assert np.all((before < 1 + 1e-9) == (first.kind == "stability_lost"))
+
+
+def assert_signs_change(family, points, values, tolerance):
+    """An odd number of points lies between two orbits if and only if the values there have opposite signs."""
+    places = np.array([float(point.arclength) for point in points])
+    errors = np.array([float(point.error_estimate[0]) for point in points])
+    where, values = np.asarray(family.arclength), np.asarray(values)
+    near = np.any(np.abs(where[:, None] - places) <= errors, axis=1) if len(points) else np.zeros(len(where), bool)
+    sure = np.flatnonzero((np.abs(values) > tolerance) & ~near)
+    passed = np.searchsorted(places, where[sure])
+    odd = np.diff(passed) % 2 == 1
+    np.testing.assert_array_equal(odd, np.sign(values[sure[1:]]) != np.sign(values[sure[:-1]]))
+
+
+def in_one_piece(orbit):
+    """kappa of a centred orbit from Phi(T/4), and what rounding leaves of it: ten times the scatter of four numbers
+    of steps and releases 1e-14 apart.
+    """
+
+    def kappa(steps, shift):
+        moved = dataclasses.replace(orbit.state, theta2=orbit.theta2 + shift)
+        quarter = np.asarray(monodromy(dataclasses.replace(orbit, state=moved), 0.25, steps))
+        growths.append(float(growth_of(quarter[None], "centred")))
+        return 2 * (1 - 2 * np.sum(quarter[:2, :2] * quarter[2:, 2:])) ** 2 - 1
+
+    growths = []
+    here, *others = (kappa(*how) for how in ((1600, 0.0), (1200, 1e-14), (2000, -1e-14), (2400, 0.0)))
+    return here, 10 * np.max(np.abs(np.array(others) - here)) + 4e-13 * growths[0]
+
+
+def test_a_touch_a_fold_and_a_crossing_close_together():
+    """m2/m1 = 2: the in-phase family runs through the curve of threefold anti-phase orbits at theta1 = -0.1312, where c
+    touches 1, and gains its stability 0.0017 further on, where its energy turns back: c - 1 changes sign just there.
+    """
+    family = dpend.follow_family(Pendulum(1.0, 1.0, 1.0, 2.0, 1.0), "in-phase")
+    assert_special_points_are_what_they_say(family)
+    crossing, fold, gained = (p for p in family.special_points if abs(p.arclength - 2.0425) < 0.01)
+    assert [crossing.kind, fold.kind, gained.kind] == ["crossing", "fold_energy", "stability_gained"]
+    np.testing.assert_allclose([fold.arclength - crossing.arclength, gained.arclength - fold.arclength], [1.665e-3, 0],
+        atol=2e-6)  # fmt: skip
+    # There the anti-phase family has c = cos(2 pi/3), at a third of the period.
+    other = dpend.follow_family(Pendulum(1.0, 1.0, 1.0, 2.0, 1.0), "anti-phase")
+    third = next(p for p in other.special_points if p.kind == "resonance_3:2")
+    np.testing.assert_allclose(abs(third.orbit.theta1), abs(crossing.orbit.theta1), atol=2e-6)
+    np.testing.assert_allclose(3 * third.orbit.period, crossing.orbit.period, rtol=1e-6)
+    kinds = [p.kind for p in family.special_points if p.kind.startswith("stability")]
+    assert kinds == ["stability_lost", "stability_gained", "stability_lost"]
+
+
+@pytest.mark.slow
+def test_windows_narrower_than_rounding_are_not_told():
+    """l2/l1 = 18.13, m2/m1 = 6.64, anti-phase: within 3e-8 of arclength c passes from -1 to 1, and rounding leaves 0.04
+    of it unknown: there is no saying where which resonance is.
+    """
+    family = dpend.follow_family(Pendulum(1.0, 18.13, 1.0, 6.640, 1.0), "anti-phase")
+    assert_special_points_are_what_they_say(family)
+    assert not [p.kind for p in family.special_points if 4.0 < p.arclength < 4.2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lengths", "masses"), [(9.4, 2.64), (0.817, 12.176), (0.2302, 0.7196), (19.468, 5.775)])
+def test_stability_that_changes_at_a_crossing(lengths, masses):
+    """Where a family runs through fivefold (or more) orbits c - 1 vanishes with its derivatives, and the energy turns
+    back: one change of stability, there.
+    """
+    family = dpend.follow_family(Pendulum(1.0, lengths, 1.0, masses, 1.0), "in-phase")
+    assert_special_points_are_what_they_say(family)
+    crossings = [p for p in family.special_points if p.kind == "crossing"]
+    assert crossings
+    for crossing in crossings:
+        near = [p for p in family.special_points if abs(p.arclength - crossing.arclength) < 3e-4 and p is not crossing]
+        assert sorted(p.kind for p in near) == ["fold_energy", "stability_gained"]
+        assert near[0].arclength == near[1].arclength
+
+
+# Pendulums with l2/l1 and m2/m1 from 1/20 to 20.
+RANDOM = np.exp(np.random.default_rng(7).uniform(-np.log(20), np.log(20), (60, 2)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("some", range(6))
+@pytest.mark.parametrize("branch", BOTH)
+def test_special_points_of_random_pendulums(branch, some):
+    for lengths, masses in RANDOM[some::6]:
+        family = dpend.follow_family(Pendulum(1.0, lengths, 1.0, masses, 1.0), branch)
+        assert_special_points_are_what_they_say(family)
+
+
 @pytest.mark.parametrize("branch", BOTH)
 def test_both_ends(unit, families, branch):
     """At zero amplitude the normal mode; at the other end the upright pendulum, and T = const - (2/lambda) ln gap with
@@ -113,7 +243,10 @@ def test_every_point_is_right_to_twelve_digits(unit, families, branch):
     """Against shooting over the quarter period in one piece, which still carries up to kappa = 1e8."""
     family = families[branch]
     assert np.max(family.orbits.error_estimate[0]) < 1e-12
-    assert np.max(family.orbits.error_estimate[1] / family.orbits.period) < 1e-12
+    # At its theta1 the period of an orbit near the upright state changes by the inverse distance from there.
+    relative = family.orbits.error_estimate[1] / family.orbits.period
+    assert np.max(relative[family.orbits.theta1 < 3.14]) < 1e-12
+    assert np.max(relative) < 1e-11
     angles = np.linspace(0.05, 2.9, 9)
     one_by_one = [dpend.find_orbit(unit, theta1, branch=branch) for theta1 in angles]
     found, orbits = jax.tree.map(lambda *leaves: np.stack(leaves), *one_by_one), family.at(angles)
@@ -309,6 +442,19 @@ def test_orbits_are_not_held_twice(paper):
     assert family.ends == ("branch point", "longest period")
     np.testing.assert_allclose(family.orbits.period[-1], 2.6, rtol=1e-12)
     assert np.all(np.diff(family.orbits.period) > 0)
+
+
+@pytest.mark.slow
+def test_a_dip_between_two_orbits_is_looked_into(paper):
+    """Brake orbits with kappa = 63, 17 and 234 one after the other: between them it falls below -1 and comes back."""
+    orbit = dpend.find_orbit(paper, np.radians(81.55118), guess=(np.radians(-113.608201545), 1.647422305))
+    family = dpend.follow_family(paper, orbit, longest_period=2.0)
+    kinds = [p.kind for p in family.special_points if p.kind.startswith("stability")]
+    assert np.min(family.orbits.kappa) > 10
+    assert kinds == ["stability_gained", "stability_lost"] * 2 or kinds == ["stability_lost", "stability_gained"] * 2
+    for p in family.special_points:
+        if p.kind.startswith("stability"):
+            np.testing.assert_allclose(abs((np.trace(monodromy(p.orbit, 1.0)) - 2) / 2), 1, atol=1e-6)
 
 
 def test_families_up_to_a_period(unit):

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import dpend
 
-ORDER = """_runtime files trig pendulum steppers trajectory events lanes chaos sweeps stability shooting continuation
-orbits families scan atlas survey certify measurements windows fit gradients design plots animate cli""".split()
+ORDER = """_runtime checks files trig pendulum steppers trajectory events lanes chaos stores sweeps stability
+shooting continuation orbits families scan catalogue atlas survey certify measurements windows fit gradients design
+plots animate cli""".split()
 HOUSE = Path(dpend.__file__).parent
 
 

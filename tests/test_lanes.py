@@ -75,6 +75,15 @@ def test_several_launches_come_back_in_order(paper, monkeypatch):
     assert len(traces) == before <= 3
 
 
+def test_long_motions_come_in_small_pieces(paper):
+    """Of the same compiled program, with the same bits."""
+    whole = lanes.over_lanes(END, paper, releases())
+    pieces = list(lanes.launches(END, paper, releases(), 1e9))
+    assert len(pieces) == -(-CELLS // (lanes.WIDTH * jax.local_device_count()))
+    for key, values in whole.items():
+        np.testing.assert_array_equal(np.concatenate([piece[key] for piece in pieces]), values)
+
+
 def test_results_of_any_shape_come_lanes_last(paper):
     """A table for each lane, beside a scalar; launches are then smaller, so that there are several."""
     states = releases()

@@ -3,6 +3,7 @@
 import itertools
 from functools import partial
 
+import extended
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -324,3 +325,35 @@ def test_extreme_mass_ratios(mass):
             missed = max(abs(back.state.theta1[0]), abs(back.state.theta2[0]))
             # Both integrations' own errors, grown as the motion grows.
             assert missed < 1e-9 + 10 * back.error_estimate + 1e-10 * abs(orbit.kappa) ** 0.5
+
+
+@pytest.mark.parametrize(("which", "k"), [(0, 17), (0, 18), (0, 50), (3, 18), (2, 18), (4, 17), (4, 18)])
+def test_no_multiple_of_the_period_is_too_large(paper, which, k):
+    """Centred and brake orbits, stable and not, guessed with many times their period."""
+    theta2, period, symmetry = FORTY[which]
+    once = find(paper, 40, guess=(np.radians(theta2), period), error=False)
+    orbit = find(paper, 40, guess=(float(once.theta2), k * float(once.period)), error=False)
+    assert orbit.symmetry == (symmetry or "brake")
+    np.testing.assert_allclose(orbit.theta2, once.theta2, atol=1e-11)
+    np.testing.assert_allclose([orbit.period, orbit.kappa], [once.period, once.kappa], rtol=1e-9)
+
+
+def test_a_guess_too_long_to_be_integrated_says_so(paper):
+    orbit = dpend.find_orbit(paper, np.radians(40), guess=(np.radians(-51.139513966), 1e6 * 0.754418866), error=False)
+    assert orbit.status == Status.BEYOND_HORIZON
+    assert np.isnan(orbit.kappa)
+
+
+@pytest.mark.slow
+def test_no_error_is_above_ten_times_its_estimate():
+    """Random pendulums and releases against Newton's method in long double, by another integrator."""
+    pytest.importorskip("heyoka")
+    if not extended.is_extended():
+        pytest.skip("long double is double here")
+    import orbit_errors
+
+    rows, _ = orbit_errors.measure(12, seed=5, most_points=60)
+    ratios = orbit_errors.ratios_of(rows)
+    assert len(rows) > 60
+    assert np.min(ratios) > 0.1
+    assert np.all((np.median(ratios, axis=0) > 2) & (np.median(ratios, axis=0) < 20))

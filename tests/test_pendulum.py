@@ -184,6 +184,29 @@ def test_bad_numbers_are_refused():
         dpend.normal_modes(Pendulum(g=-9.8))
 
 
+def test_arrays_are_numbers_too():
+    """Signs are looked at in arrays as well, integers and single precision become float64, NaN may stand for a cell."""
+    for lengths in (
+        np.array([0.2, -0.2]),
+        jnp.array([0.2, 0.0]),
+        np.array(-0.2),
+        jnp.asarray(-0.2),
+        jnp.asarray(jnp.nan),
+    ):
+        with pytest.raises(ValueError, match="l1 must be a finite positive number .*, got"):
+            Pendulum(l1=lengths)
+    pendulum = Pendulum(l1=np.array([1, 2]), l2=jnp.asarray([0.5, np.nan], jnp.float32), m1=np.float32(0.5), g=-1)
+    assert {leaf.dtype for leaf in jax.tree.leaves(pendulum)} == {np.dtype(float)}
+    assert np.isnan(pendulum.l2[1])
+    with pytest.raises(ValueError, match=r"theta1, theta2, p1, p2 must have one shape, got \(3,\), \(2,\), \(\), \(\)"):
+        State(np.zeros(3), np.zeros(2), 0.0, 0.0)
+    assert State(np.zeros((3, 1)), np.zeros(2), 0.0, 0.0).theta1.shape == (3, 1)
+    lost = State(jnp.asarray(jnp.nan), 0.0, 0.0, 0.0)  # the end of a motion that was lost is data
+    assert np.isnan(dpend.hamiltonian(Pendulum(), lost))
+    with pytest.raises(ValueError, match="theta1 must be a finite number .* got nan"):
+        State(np.array(np.nan), 0.0, 0.0, 0.0)
+
+
 def test_transformations_pass_through_the_data_classes(paper):
     """Tracers, masks and `None` are not numbers to be checked."""
     lengths = jnp.array([0.1, 0.2, 0.4])

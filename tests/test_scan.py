@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import dpend
-from dpend.scan import _Cells, scanned
+from dpend.scan import Budget, _Cells, scanned
 from dpend.shooting import natural
 
 # The paper's pendulum released at 40 deg: theta2 [deg] and period of every return within 1 s, as scanned elsewhere on
@@ -28,7 +28,7 @@ def scan(pendulum, theta1_deg, max_period, intervals=128):
     """Returns to rest, times in seconds."""
     second = float(np.sqrt(pendulum.l1 / pendulum.g))
     scaled = jax.tree.map(float, natural(pendulum))
-    result = scanned(scaled, float(np.radians(theta1_deg)), 0.5 * max_period / second, intervals)
+    result = scanned(scaled, float(np.radians(theta1_deg)), 0.5 * max_period / second, intervals, Budget(10**9))
     return result, np.array([(zero.theta2, zero.time * second) for zero in result.zeros]).reshape(-1, 2)
 
 

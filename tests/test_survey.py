@@ -1,5 +1,7 @@
 """The whole square: linear theory at the families' ends, single angles, an interruption, and the table's rows."""
 
+import json
+
 import jax
 import numpy as np
 import pytest
@@ -33,6 +35,139 @@ def test_the_only_family_below_the_period_of_every_other_mode(paper):
     np.testing.assert_allclose(only["shortest_period_s"], fast.period, rtol=1e-7)
     assert np.all(np.diff(found.table["period"]) > 0)
     assert np.all(np.diff(found.table["energy"]) > 0)
+
+
+@pytest.fixture(scope="module")
+def kept(paper, tmp_path_factory):
+    """A store with three slices, and the search that left it."""
+    store = tmp_path_factory.mktemp("search") / "search.json"
+
+    def stop(done, planned, families):
+        if done == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        dpend.find_brake_families(paper, max_period=0.9, store=store, progress=stop)
+    return store.read_text()
+
+
+def changed(*path, value):
+    """A store with something set, or deleted, its checksum as it was."""
+
+    def damage(text):
+        record = part = json.loads(text)
+        for key in path[:-1]:
+            part = part[key]
+        if value is Ellipsis:
+            del part[path[-1]]
+        else:
+            part[path[-1]] = value
+        return json.dumps(record)
+
+    return damage
+
+
+def forged(*path, value):
+    """The same with a checksum that fits."""
+
+    def damage(text):
+        record = json.loads(changed(*path, value=value)(text))
+        return json.dumps(record | {"checksum": survey._checksum(record)})
+
+    return damage
+
+
+WROTE = "store must be a file that find_brake_families wrote, got .*"
+SETTINGS = "store must have been made with the same settings, got .*"
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda text: "", WROTE + "Expecting value"),
+        (lambda text: "{}", WROTE + "the store has no settings"),
+        (lambda text: "[]", WROTE + "the store must be an object"),
+        (lambda text: "[" * 10**6, WROTE + "nested too deeply"),
+        (lambda text: text[:-30], WROTE + "line"),
+        (lambda text: text.replace('"lost": 0', '"lost": NaN', 1), WROTE + "NaN is no JSON number"),
+        (lambda text: text.replace('"lost"', '"lost": 0, "lost"', 1), WROTE + "'lost' stands twice"),
+        (changed("slices", 1, value=...), WROTE + "it was changed since, or damaged"),
+        (changed("slices", 1, "returns", 0, 1, value=0.75), WROTE + "it was changed since"),
+        (changed("slices", 1, "degree", value=7), WROTE + "it was changed since"),
+        (changed("slices", 1, "degree", value=True), WROTE + r"slices\[1\].degree must be an integer, is True"),
+        (changed("slices", 1, "degree", value="1"), WROTE + r"slices\[1\].degree must be an integer"),
+        (changed("slices", 1, "theta1", value=...), WROTE + r"slices\[1\] has no theta1"),
+        (changed("slices", 1, "returns", 0, value=[1.0]), WROTE + r"returns\[0\] must have 2 numbers"),
+        (changed("slices", value={}), WROTE + "slices must be a list"),
+        (changed("families", value=[]), WROTE + "it was changed since"),
+        (changed("families", 0, "level", value=3), WROTE + "it was changed since"),
+        (changed("families", 0, "seed", value=None), WROTE + r"families\[0\].seed must be a list"),
+        (changed("checksum", value=...), WROTE + "the store has no checksum"),
+        (changed("settings", "max_period", value=0.8), WROTE + "it was changed since"),
+        (forged("settings", "max_period", value=0.8), SETTINGS + "with max_period 0.8"),
+        (forged("settings", "pendulum", "l1", value=0.3), SETTINGS + "with pendulum"),
+        (forged("settings", value={}), SETTINGS + "with dpend_version None"),
+        (forged("settings", "more", value=1), SETTINGS + "with more 1"),
+        (forged("slices", 0, value=...), WROTE + r"slices\[0\].theta1 is 0.78"),
+        (forged("slices", 1, "theta1", value=0.1), WROTE + r"slices\[1\].theta1 is 0.1, which is not the next one"),
+        (forged("slices", 1, "motions", value=-1), WROTE + r"slices\[1\].motions must be at least 0"),
+        (forged("slices", 1, "returns", 0, value=[0.1, 9.0]), WROTE + r"slices\[1\].returns has \(0.1, 9\)"),
+        (forged("families", 0, "seed", value=[1.0, 1.0, 0.5]), WROTE + r"families\[0\] begins at none"),
+        (forged("families", 0, "level", value=99), WROTE + r"families\[0\] begins at none"),
+    ],
+)
+def test_a_damaged_store_is_refused(paper, kept, tmp_path, damage, said):
+    store = tmp_path / "damaged.json"
+    store.write_text(damage(kept))
+    with pytest.raises(ValueError, match=said) as refusal:
+        dpend.find_brake_families(paper, max_period=0.9, store=store)
+    assert "\n" not in str(refusal.value)
+    assert store.read_text() == damage(kept)
+
+
+def test_what_would_never_end_is_refused_before_it_begins(paper):
+    """The number of motions grows exponentially: told from a few of them, within a second."""
+    with pytest.raises(ValueError, match="max_period must be so short that most_steps, 3e.08, are enough, got 15.8 s"):
+        dpend.find_brake_families(paper, max_period=15.8)
+    with pytest.raises(ValueError, match="most_steps must be a finite positive number"):
+        dpend.find_brake_families(paper, max_period=0.6, most_steps=0)
+    with pytest.raises(
+        ValueError, match=r"m1 and m2 must be within a factor of 1e30 of each other.* got 1e\+300 and 0.1"
+    ):
+        dpend.find_brake_families(Pendulum(m1=1e300), max_period=1.0)
+
+
+@slow
+def test_a_search_that_ran_out_of_steps_says_so_and_goes_on(paper, tmp_path):
+    """What it took is at least what it was allowed; the whole follows from the store."""
+    store = tmp_path / "search.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(survey, "expected_steps", lambda *_: 1)
+        some = dpend.find_brake_families(paper, max_period=0.6, store=store, most_steps=600_000)
+    assert some.coverage.exhausted
+    assert 0 < some.coverage.slices < 31
+    for ending in ("csv", "json"):
+        some.save(tmp_path / f"some.{ending}")
+        assert dpend.load_atlas(tmp_path / f"some.{ending}").coverage == some.coverage
+    whole = dpend.find_brake_families(paper, max_period=0.6, store=store)
+    assert (whole.coverage.exhausted, whole.coverage.slices, whole.coverage.suspicious_cells) == (False, 31, 0)
+
+
+@slow
+def test_two_searches_with_one_store(paper, tmp_path):
+    """Each slice of one is followed by one of the other: both are whole, and so is the store at any time."""
+    store, turns = tmp_path / "search.json", []
+
+    def other(done, planned, families):
+        if done in (2, 9) and done not in turns:
+            turns.append(done)
+            turns.append(dpend.find_brake_families(paper, max_period=0.6, store=store))
+
+    one = dpend.find_brake_families(paper, max_period=0.6, store=store, progress=other)
+    for found in [one, *turns[1::2]]:
+        assert (found.coverage.slices, found.coverage.suspicious_cells, len(found)) == (31, 0, len(one))
+    again = dpend.find_brake_families(paper, max_period=0.6, store=store)
+    np.testing.assert_array_equal(again.table["theta2"], one.table["theta2"])
 
 
 @slow
@@ -121,9 +256,6 @@ def test_a_search_that_was_stopped_goes_on(square, paper, tmp_path):
         np.testing.assert_array_equal(again.table[key], column)
     with pytest.raises(ValueError, match="store must have been made with the same settings"):
         dpend.find_brake_families(paper, max_period=1.1, store=store)
-    store.write_text("{}")
-    with pytest.raises(ValueError, match="store must be a file that find_brake_families wrote"):
-        dpend.find_brake_families(paper, max_period=LONGEST, store=store)
 
 
 @slow

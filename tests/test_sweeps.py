@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import ks_2samp
 
 import dpend
-from dpend import Pendulum, Status, chaos, sweeps
+from dpend import Pendulum, Status, chaos, stores, sweeps
 
 FLIP = partial(chaos.flip, duration=3.0)
 LYAPUNOV = partial(chaos.lyapunov, duration=2.0)
@@ -170,18 +170,19 @@ def test_a_store_that_cannot_be_written_to_is_read_if_it_is_finished(paper, tmp_
 def test_an_unfinished_store_is_finished_with_the_same_bytes(paper, tmp_path, monkeypatch):
     """Stopped at every tile in turn, one of them between its values and its status."""
     monkeypatch.setattr(sweeps, "_TILE", 7)
+    monkeypatch.setattr(stores, "_sync", lambda place: None)
     axes = {"theta1": SIDE, "theta2": SIDE}
     dpend.sweep(FLIP, paper, axes, store=tmp_path / "whole.zarr")
-    write, stopped, tries = sweeps._write, tmp_path / "stopped.zarr", 0
+    write, stopped, tries = stores.Store._write_chunk, tmp_path / "stopped.zarr", 0
 
-    def breaks(path, array, block, values):
+    def breaks(*arguments):
         nonlocal tries
         tries += 1
         if tries % 6 == 0:
             raise KeyboardInterrupt
-        write(path, array, block, values)
+        return write(*arguments)
 
-    monkeypatch.setattr(sweeps, "_write", breaks)
+    monkeypatch.setattr(stores.Store, "_write_chunk", breaks)
     for _ in range(200):
         try:
             dpend.sweep(FLIP, paper, axes, store=stopped)
@@ -229,6 +230,105 @@ def test_bad_sweeps_are_refused(paper):
             dpend.sweep(**({"quantity": LYAPUNOV, "pendulum": paper, "axes": axes} | settings))
     with pytest.raises(ValueError, match="g must not be zero for a tolerance"):
         dpend.sweep(LYAPUNOV, Pendulum(g=0.0), axes)
+    with pytest.raises(ValueError, match="quantity must have settings that can be hashed"):
+        dpend.sweep(partial(cheap, factors=[1.0]), paper, axes)
+
+
+def test_no_gravity_at_an_end_of_the_axis(paper):
+    """The step is that of the pendulums that have one, as where zero lies inside."""
+    ends, inside = ({"g": np.array(values)} for values in ([0.0, 9.8], [-9.8, 0.0, 9.8]))
+    steps = [dpend.sweep(cheap, paper, axes, at={"theta1": 1.0}).attrs["step"] for axes in (ends, inside)]
+    assert steps == [dpend.scheme_for(paper, 1e-6).step] * 2
+
+
+def cheap(pendulum, state, scheme, *, factors=(1.0, 2.0), duration=1.0):
+    return {"sum": factors[0] * state.theta1 + factors[1] * state.theta2}
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        ({"duration": 1e6}, "at most 1e.06 steps to one motion and 1e.12 to all, got duration 1e.06 s, step 0.0289 s"),
+        ({"duration": 1e300}, "got duration 1e.300 s"),
+        (
+            {"step": 1e-9, "method": "rk4"},
+            "step 1e-09 s, which make 1e.09 and 1.2e.10: give a shorter duration, a larger",
+        ),
+        ({"pendulum": Pendulum(g=1e300)}, "got duration 1 s, step 9.05e-152 s"),
+        ({"pendulum": Pendulum(l1=1e-300)}, "got duration 1 s"),
+        ({"pendulum": Pendulum(m2=1e300)}, "got duration 1 s"),
+        ({"at": {"p2": 10.0}, "duration": 100.0}, "steps to one motion"),  # turns fast: short steps all the way
+        ({"most_steps": 100.0}, "at most 0.0001 steps to one motion and 100 to all"),
+        ({"most_steps": 1e16}, r"most_steps must be at most 1e\+15, got 1e\+16"),
+        ({"most_steps": math.nan}, "most_steps must be a finite positive number"),
+    ],
+)
+def test_what_would_never_end_is_refused(paper, tmp_path, settings, text):
+    """Before anything is computed or written, and before JAX traces a loop that it cannot count."""
+    duration = settings.pop("duration", 1.0)
+    quantity = partial(chaos.flip, duration=duration)
+    settings = {"pendulum": paper, "axes": {"theta1": SIDE}, "store": tmp_path / "m.zarr"} | settings
+    with pytest.raises(ValueError, match=text):
+        dpend.sweep(quantity, **settings)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_limit_that_is_told_is_enough(paper):
+    """Of what is refused, the line says which limit lets it pass, and no less does."""
+    settings = {"pendulum": paper, "axes": {"theta1": SIDE}, "method": "rk4", "step": 1e-2}
+    with pytest.raises(ValueError, match="or most_steps=1.01e.08") as refused:
+        dpend.sweep(partial(cheap, duration=1.0), **settings, most_steps=1e6)
+    enough = float(str(refused.value).rpartition("=")[2])
+    told = []
+    dpend.sweep(partial(cheap, duration=1.0), **settings, most_steps=enough, announce=told.append)
+    assert (told[0].cells, told[0].each, told[0].steps) == (12, 100.0, 1200.0)  # the other 12 are images
+    assert told[0].bytes == 24 * 9
+    with pytest.raises(ValueError, match="steps to one motion"):
+        dpend.sweep(partial(cheap, duration=1.0), **settings, most_steps=0.97 * enough)
+
+
+def counted(pendulum, state, scheme):
+    return {"angle": state.theta1, "steps": (1e7 + 0.0 * state.theta1).astype(int)}
+
+
+def test_the_first_cells_tell_what_no_setting_does(paper):
+    with pytest.raises(ValueError, match=r"got step 0.0289 s, which make 1e\+07 and 1.2e\+08"):
+        dpend.sweep(counted, paper, {"theta1": SIDE})
+    assert dpend.sweep(counted, paper, {"theta1": SIDE}, most_steps=1e14).angle.shape == (24,)
+
+
+def test_more_than_the_memory_is_refused(paper):
+    axes = {"theta1": np.linspace(0.0, 1.0, 3_000_000), "theta2": np.linspace(0.0, 1.0, 3_000_000)}
+    with pytest.raises(
+        ValueError, match="axes must leave values that the memory holds, got .* GB for .*: give a store"
+    ):
+        dpend.sweep(cheap, paper, axes)
+
+
+class Scaled:
+    """A quantity with a state of its own."""
+
+    def __init__(self, factor):
+        self.factor = factor
+
+    def __call__(self, pendulum, state, scheme):
+        return {"angle": self.factor * state.theta1}
+
+    def scaled(self, pendulum, state, scheme):
+        return self(pendulum, state, scheme)
+
+
+def test_quantities_that_look_alike_need_a_name(paper, tmp_path):
+    """Two objects of a class, and what was typed at a prompt, have nothing to be told apart by."""
+    typed = {}
+    exec("def typed(pendulum, state, scheme): return {'angle': state.theta1}", typed)
+    for quantity in (Scaled(2.0), Scaled(2.0).scaled, typed["typed"]):
+        with pytest.raises(ValueError, match="name must be given to store a quantity that is no function in a file"):
+            dpend.sweep(quantity, paper, {"theta1": SIDE}, store=tmp_path / "m.zarr")
+    store = tmp_path / "m.zarr"
+    dpend.sweep(Scaled(2.0), paper, {"theta1": SIDE}, store=store, name="twice the angle")
+    with pytest.raises(ValueError, match="its quantity is 'twice the angle', not 'thrice the angle'"):
+        dpend.sweep(Scaled(3.0), paper, {"theta1": SIDE}, store=store, name="thrice the angle")
 
 
 @pytest.mark.slow

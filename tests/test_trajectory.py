@@ -1,5 +1,6 @@
 """Motions against other integrators and invariants; what a result says of itself."""
 
+import extended
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import dpend
 from dpend import Pendulum, Scheme, State, Status
-from dpend.trajectory import known_value
+from dpend.checks import known_value
 
 RELEASE = dpend.released(np.radians(100), np.radians(-30))
 RK8 = Scheme("rk8", 4e-3)
@@ -150,29 +151,139 @@ def test_what_went_wrong_is_a_status(paper):
     assert status(paper, State(jnp.nan * jnp.ones(()), 0.0, 0.0, 0.0), 1.0) == Status.NONFINITE
     chaotic = dpend.released(np.radians(170), np.pi)
     assert status(paper, chaotic, 20.0, tolerance=1e-6) == Status.BEYOND_HORIZON
+    assert status(paper, dpend.released(0.3, 0.2), 2.0, tolerance=1e-15) == Status.TOLERANCE_NOT_REACHED
     assert status(paper, RELEASE, 1.0, step=5e-3, error=False) == Status.CONVERGED
     assert len({dpend.message(member) for member in Status}) == len(Status)
 
 
+def test_the_sentence_tells_the_estimate_and_the_wish(paper):
+    """What is refused at an estimate of 5e-9 rad is so because 1e-9 is the default."""
+    hard = dpend.released(np.radians(170), np.pi)
+    motion = dpend.simulate(paper, hard, 7.5)
+    assert motion.status == Status.BEYOND_HORIZON
+    estimate = f"{float(motion.error_estimate):.1e} rad"
+    assert motion.message.startswith(
+        f"The error estimate, {estimate}, is above the tolerance of 1e-09 rad, which is the default: "
+        "the motion is chaotic, and errors of rounding have grown so far; shorten it or ask for a tolerance of "
+    )
+    enough = float(motion.message.split("tolerance of ")[-1].split(" rad")[0])
+    assert dpend.simulate(paper, hard, 7.5, tolerance=enough).message == "Converged."
+    tame = dpend.simulate(paper, dpend.released(0.3, 0.2), 2.0, tolerance=1e-15)
+    assert "is above the tolerance of 1e-15 rad: no step brings it lower; ask for a tolerance of" in tame.message
+    drifted = dpend.simulate(paper, hard, 20.0, step=2e-3)
+    assert "is above 0.1 rad, where it has parted from the true motion" in drifted.message
+    assert drifted.message.endswith("; shorten it.")
+
+
+def error_of(motion, exact):
+    """The larger angle's, at the worst saved time but the first [rad]."""
+    angles = (motion.state.theta1, exact.state.theta1), (motion.state.theta2, exact.state.theta2)
+    return max(float(np.max(np.abs(np.asarray(ours)[1:] - np.asarray(theirs)))) for ours, theirs in angles)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("duration", "tolerance"), [(2.0, 1e-3), (2.0, 1e-6), (2.0, 1e-9), (5.0, 1e-6)])
+@pytest.mark.parametrize(("duration", "tolerance"), [(2.0, 1e-3), (2.0, 1e-6), (2.0, 1e-9), (5.0, 1e-6), (5.0, 1e-9)])
 def test_a_tolerance_holds_on_the_whole_square(paper, duration, tolerance):
-    """Of the releases that are passed as right 99 in 100 are; not many are given up, and those were hard."""
+    """Of the releases that are passed as right 99 in 100 are; hardly any are given up."""
     angles = np.random.default_rng(1).uniform(-np.pi, np.pi, (100, 2))
     passed, right = 0, 0
     for theta1, theta2 in angles:
         release = dpend.released(theta1, theta2)
         motion = dpend.simulate(paper, release, duration, tolerance=tolerance)
         assert motion.status in (Status.CONVERGED, Status.BEYOND_HORIZON)
-        exact = dpend.reference(paper, release, [duration])
-        if motion.status == Status.CONVERGED and exact.error_estimate < tolerance / 4:
-            error = max(
-                abs(motion.state.theta1[-1] - exact.state.theta1), abs(motion.state.theta2[-1] - exact.state.theta2)
-            )
-            passed, right = passed + 1, right + bool(error <= tolerance + exact.error_estimate)
+        exact = dpend.reference(paper, release, motion.time[1:])
+        if motion.status == Status.CONVERGED:
             assert motion.error_estimate <= tolerance
+            error = error_of(motion, exact)
+            passed, right = passed + 1, right + bool(error <= tolerance + exact.error_estimate)
     assert right >= 0.99 * passed
-    assert passed >= (85 if duration == 2.0 else 60)
+    assert passed >= (99 if tolerance > 1e-9 or duration < 5.0 else 85)
+
+
+# Each was passed as right by version 0.1.0 or on the way from it, 2.5 to 7 times the tolerance or estimate off.
+SHORT_AND_LIGHT = Pendulum(0.2, 0.0034391523589411225, 0.1, 0.0011697266598131191)
+HIDDEN = [
+    (Pendulum(), (2.4800729058617197, -0.4855839947738212), 2.0, 1e-11),
+    (Pendulum(), (1.8431335863742246, -1.1399816116213168), 5.0, 1e-10),
+    (SHORT_AND_LIGHT, (-0.9589484415305338, 1.7714192154162474), 2.297582076291769, 2.3129797700696147e-09),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("pendulum", "release", "duration", "tolerance"), HIDDEN)
+def test_errors_do_not_hide(pendulum, release, duration, tolerance):
+    """A truncation error may cancel a displaced start's, and two sums of rounding errors may come close by chance."""
+    if not extended.is_extended():
+        pytest.skip("long double is double here")
+    motion = dpend.simulate(pendulum, dpend.released(*release), duration, tolerance=tolerance)
+    rows = np.linspace(1, motion.time.size - 1, 20).astype(int)
+    numbers = [float(leaf) for leaf in jax.tree.leaves(pendulum)]
+    exact = extended.motion(numbers, (*release, 0.0, 0.0), np.asarray(motion.time)[rows], longest=2e-3)
+    ours = np.stack([np.asarray(motion.state.theta1)[rows], np.asarray(motion.state.theta2)[rows]], axis=1)
+    error = float(np.max(np.abs(ours - exact[:, :2])))
+    assert error < 1.25 * motion.error_estimate
+    assert motion.status != Status.CONVERGED or error <= tolerance
+
+
+def random_pendulum(random):
+    """Lengths and masses as different as a thousand to one, a release or a start in motion, two slow periods."""
+    pendulum = Pendulum(0.2, 0.2 * 10 ** random.uniform(-3, 3), 0.1, 0.1 * 10 ** random.uniform(-3, 3))
+    slow, fast = (float(mode.frequency) for mode in dpend.normal_modes(pendulum))
+    rates = slow * random.normal(size=2) * random.integers(2)
+    state = dpend.momenta(pendulum, *random.uniform(-np.pi, np.pi, 2), *rates)
+    return pendulum, state, min(4 * np.pi / slow, 100 / fast)
+
+
+@pytest.mark.slow
+def test_a_tolerance_holds_for_other_pendulums():
+    """By diffrax, as far as it knows its own error: none off by more than twice the tolerance, one in 100 above it."""
+    random = np.random.default_rng(3)
+    passed, right, most = 0, 0, 120
+    for _ in range(most):
+        pendulum, state, duration = random_pendulum(random)
+        tolerance = 10 ** random.uniform(-9, -3)
+        motion = dpend.simulate(pendulum, state, duration, tolerance=tolerance, save_every=10)
+        assert motion.status in (Status.CONVERGED, Status.BEYOND_HORIZON, Status.TOLERANCE_NOT_REACHED)
+        exact = dpend.reference(pendulum, state, motion.time[1:])
+        if motion.status == Status.CONVERGED and exact.error_estimate < tolerance / 2:
+            error = error_of(motion, exact) - float(exact.error_estimate)
+            assert error < 2 * tolerance
+            passed, right = passed + 1, right + bool(error <= tolerance)
+    assert right >= 0.99 * passed
+    assert passed > 0.7 * most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance", [1e-7, 1e-10, 1e-13])
+def test_reference_knows_its_error(paper, tolerance):
+    """By long double: none above the estimate, which is at most some hundred times larger."""
+    if not extended.is_extended():
+        pytest.skip("long double is double here")
+    random = np.random.default_rng(4)
+    for theta1, theta2 in random.uniform(-np.pi, np.pi, (20, 2)):
+        found = dpend.reference(paper, dpend.released(theta1, theta2), [0.5, 1.0, 2.0], tolerance=tolerance)
+        exact = extended.motion((0.2, 0.2, 0.1, 0.1, 9.8), (theta1, theta2, 0.0, 0.0), [0.5, 1.0, 2.0])
+        ours = np.stack([np.asarray(found.state.theta1), np.asarray(found.state.theta2)], axis=1)
+        assert np.max(np.abs(ours - exact[:, :2])) < found.error_estimate < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", ["step", "tolerance", "reference"])
+def test_an_estimate_is_never_below_rounding_times_growth(paper, make):
+    for theta1, theta2 in np.random.default_rng(5).uniform(-np.pi, np.pi, (10, 2)):
+        release = dpend.released(theta1, theta2)
+        if make == "reference":
+            motion = dpend.reference(paper, release, [3.0])
+        else:
+            motion = dpend.simulate(paper, release, 3.0, **{"step": 1e-3} if make == "step" else {"tolerance": 1e-12})
+        tangents = State(*np.eye(4)[:, :2])
+        _, moved = dpend.fold(_untouched, 0.0, paper, release, 3.0, Scheme("rk8-circle", 1e-3), tangents=tangents)
+        growth = max(np.linalg.norm(moved.theta1), np.linalg.norm(moved.theta2))
+        assert motion.error_estimate > 0.99 * min(np.pi, np.finfo(float).eps * growth)
+
+
+def _untouched(carry, time, dt, state, tangents):
+    return carry, tangents
 
 
 @pytest.mark.slow
@@ -272,3 +383,27 @@ def test_reverse_mode_under_jit(paper):
         return dpend.flow(paper, dpend.released(theta1, 2.0), 0.5, Scheme("rk4", 1e-2)).theta1
 
     assert abs(jax.jit(jax.grad(angle))(1.0) - jax.jacfwd(angle)(1.0)) < 1e-12
+
+
+def test_a_reference_that_could_not_end_is_refused_or_says_so(paper):
+    with pytest.raises(
+        ValueError, match="tolerance must be at least 1e-13, which rounding leaves room for, got 1e-300"
+    ):
+        dpend.reference(paper, RELEASE, [1.0], tolerance=1e-300)
+    with pytest.raises(ValueError, match="most_steps must be an integer of at least 1, got 0"):
+        dpend.reference(paper, RELEASE, [1.0], most_steps=0)
+
+
+@pytest.mark.slow
+def test_a_reference_stops_after_the_steps_that_are_allowed(paper):
+    motion = dpend.reference(paper, RELEASE, [5.0], most_steps=100, error=False)
+    assert (int(motion.status), int(motion.steps)) == (Status.MAX_ITERATIONS, 100)
+
+
+def test_steps_are_counted_before_they_are_taken(paper):
+    with pytest.raises(ValueError, match="step must make at most 9 steps, got 0.1 s, which makes 10: .*most_steps"):
+        dpend.simulate(paper, RELEASE, 1.0, step=0.1, most_steps=9)
+    with pytest.raises(ValueError, match="step must make at most 1e.12 steps, got 5e-324 s, which makes inf"):
+        dpend.flow(paper, RELEASE, 1.0, dpend.Scheme("rk8", 5e-324))
+    with pytest.raises(ValueError, match="method must be one of rk4, .* got ''"):
+        dpend.simulate(paper, RELEASE, 1.0, step=0.1, method="")
