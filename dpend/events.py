@@ -1,14 +1,15 @@
 """The first time at which a function of the state crosses zero, exact to the integration method.
 
-Values and slopes at both ends of each step tell whether a function may cross zero inside it: it changes sign, or it
-heads for zero, turns back, and a cubic through those four numbers comes near zero between. Only such steps are looked
-into. There the step is taken again from the state before it, as a step of the same method of another length: no
-interpolant, whose own error would be another. A bracket of the change of sign is kept all along, so that what comes out
-is a root, or nothing. Where nothing comes out (the function jumps, has a pole, or turns back before zero) the search
-goes on behind that step.
+A function may cross zero inside a step where it changes sign, and where it heads for zero and turns
+back: a parabola through its values at the ends of the last two steps comes near zero in the last one.
+Only such steps are looked into. There the step is taken again from the state before it, as a step of
+the same method of another length: no interpolant, whose own error would be another. A bracket of the
+change of sign is kept all along, so that what comes out is a root, or nothing. Where nothing comes
+out (the function jumps, has a pole, or turns back before zero) the search goes on behind that step.
 
-A function lies on zero where it is no larger than the rounding errors of the state make it. What lies there at t = 0
-has the sign that it takes when it leaves; what is still on its way there at the end crosses at the end.
+A function lies on zero where it is no larger than the rounding errors of the state make it. What lies
+there at t = 0 has the sign that it takes when it leaves; what is still on its way there at the end
+crosses at the end.
 """
 
 from collections.abc import Callable
@@ -30,9 +31,10 @@ _MOST_ITERATIONS = 120
 _EPSILON = float(np.finfo(np.float64).eps)
 # A value of so many rounding errors of the state counts as zero.
 _ROUNDING = 8.0
-# A step is looked into where the cubic's bottom lies above zero by this share of its depth below the step's ends. The
-# cubic's error is (omega h)^2/12 of the depth for a swing of frequency omega: a swing is seen up to omega h = 1.2.
-_MARGIN = 0.125
+# A step is looked into where the parabola, inside the step or so many steps beside it, comes down to
+# this share of the difference of its slopes at the step's ends; a swing is as deep there as 1/8. Its
+# error is some (omega h)/2 of that for a swing of frequency omega: it is seen up to omega h = 0.8.
+_MARGIN, _BESIDE = 0.05, 0.3
 # Steps that are kept to be looked into in one pass. Where all of them disappoint, the next pass begins behind them: so
 # seldom, with two, that a first-flip map does not feel it.
 _SLOTS = 2
@@ -58,8 +60,8 @@ class Crossing(NamedTuple):
 
 
 class _Start(NamedTuple):
-    """A function at a step's start: its sign, its value, its change over the step at the rate
-    there; and whether the step changes its sign.
+    """A function at a step's start: its sign, its value, its change over the step at the rate there,
+    roughly; and whether the step changes its sign.
     """
 
     sign: Scalar
@@ -80,15 +82,16 @@ class _Step(NamedTuple):
 class _Search(NamedTuple):
     """What is known along the way.
 
-    `values`, `rates` [1/s] and `signs` are those of the functions after the last step; a sign is
-    zero as long as there is none. They are scalars: XLA computes those of many lanes side by side,
-    and arrays of a few numbers not. `closed`: the last of the slots changes a sign, so that no later
-    step is asked for.
+    `values` and `signs` are those of the functions after the last step, of `dt`, and `rates` [1/s]
+    their mean ones in it; a sign is zero as long as there is none. They are scalars: XLA computes
+    those of many lanes side by side, and arrays of a few numbers not. `closed`: the last of the slots
+    changes a sign, so that no later step is asked for.
     """
 
     values: tuple[Scalar, ...]
     rates: tuple[Scalar, ...]
     signs: tuple[Scalar, ...]
+    dt: Scalar
     state: State
     slots: tuple[_Step, ...]
     count: Scalar
@@ -115,9 +118,9 @@ class _Task(NamedTuple):
     start: _Start
 
 
-# What a probe does next: see whether it is at zero before the step, try the step's end, look for a
-# turn, close in on a root, judge it; or it is done.
-_ARRIVE, _END, _TURN, _ROOT, _LAST, _FOUND, _NONE = range(7)
+# What a probe does next: see whether it is at zero before the step, try the step's start, its end, look
+# for a turn, close in on a root, judge it; or it is done.
+_ARRIVE, _BEGIN, _END, _TURN, _ROOT, _LAST, _FOUND, _NONE = range(8)
 
 
 class _Sample(NamedTuple):
@@ -163,9 +166,9 @@ def first_crossing(
     however soon. A crossing within rounding of `duration` counts. A function that touches zero does not cross it, nor
     does one that jumps over it or is not a number there; what it does later counts.
 
-    Two crossings in one step are seen where a cubic through values and slopes at its ends shows them, that is of
-    functions that swing no faster than five steps a swing resolve. Of three crossings in one step one is seen; two are
-    not seen where the function turns once more in that step.
+    Two crossings in one step are seen where a parabola through the ends of two steps shows them, that is of functions
+    that swing no faster than eight steps a swing resolve. Of three crossings in one step one is seen; two are not seen
+    where the function turns once more in that step.
 
     Forward derivatives, those of `time` and `state` with respect to pendulum and state, are those of the implicit
     function theorem.
@@ -216,7 +219,8 @@ def _tasks(search: _Search, more: Scalar, duration: float, step: float) -> _Task
     tasks = []
     for slot in search.slots:
         for index, start in enumerate(slot.starts):
-            phase = jnp.where((start.sign != 0) & (slot.dt != 0), _END, _NONE)
+            phase = jnp.where(start.crossed, _END, _BEGIN)
+            phase = jnp.where((start.sign != 0) & (slot.dt != 0), phase, _NONE)
             tasks.append(_Task(jnp.asarray(index), phase, slot.before, slot.time, slot.dt, start))
     functions = zip(search.signs, search.values, search.rates, strict=True)
     for index, (sign, value, rate) in enumerate(functions):
@@ -276,19 +280,21 @@ class _Watch(NamedTuple):
         nothing = jnp.zeros_like(state.theta1)
         starts = tuple(_Start(sign, nothing, nothing, sign > 2) for sign in signs)
         slots = (_Step(state, nothing, nothing, starts),) * _SLOTS
-        return _Search(values, rates, signs, state, slots, jnp.asarray(0), nothing > 0, nothing)
+        return _Search(values, rates, signs, nothing, state, slots, jnp.asarray(0), nothing > 0, nothing)
 
     def look(self, floor: Scalar, search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
         """The `update` of `fold` that notes the steps to look into."""
-        values, rates = jax.jvp(self.values, (state,), (vector_field(self.pendulum, state),))
-        starts, changes, turns = [], [], []
-        both = zip(search.signs, search.values, search.rates, values, rates, strict=True)
-        for sign, before, rate_before, value, rate in both:
-            after = _Sample(1.0, value, dt * rate)
-            crossed, change = _goes_through(sign, after), dt * rate_before
-            starts.append(_Start(sign, before, change, crossed))
+        values, mean = self.values(state), dt / (search.dt + dt)
+        starts, rates, changes, turns = [], [], [], []
+        for sign, before, rate, value in zip(search.signs, search.values, search.rates, values, strict=True):
+            move = value - before
+            # Twice what the parabola adds to its chord's slope at the end, and takes from it at the start.
+            bend = mean * (move - dt * rate)
+            crossed = _goes_through(sign, _Sample(1.0, value, move + bend))
+            starts.append(_Start(sign, before, move - bend, crossed))
+            rates.append(move / dt)
             changes.append(crossed & self.counts(sign))
-            turns.append(_may_dip(sign, _Sample(0.0, before, change), after))
+            turns.append(_may_turn(sign * before, sign * value, sign * bend))
         closes = reduce(jnp.logical_or, changes)
         wanted = (closes | reduce(jnp.logical_or, turns)) & (jnp.abs(time) > floor)
         take = wanted & ~search.closed & (search.count < _SLOTS)
@@ -296,7 +302,7 @@ class _Watch(NamedTuple):
         slots = tuple(_choose(take & (search.count == i), step, slot) for i, slot in enumerate(search.slots))
         signs = tuple(_sign_after(start, value) for start, value in zip(starts, values, strict=True))
         count, closed = search.count + take.astype(int), search.closed | (take & closes)
-        return _Search(values, rates, signs, state, slots, count, closed, search.steps + 1.0)
+        return _Search(values, tuple(rates), signs, dt, state, slots, count, closed, search.steps + 1.0)
 
     def settle(self, duration: float, crossing: Crossing, task: _Task) -> tuple[Crossing, None]:
         """The crossing of a task, if it is earlier than the one known."""
@@ -326,6 +332,7 @@ class _Watch(NamedTuple):
         """The probe after one more try, which is `here`."""
         phases = {
             _ARRIVE: self._arrived(probe, here, rounding),
+            _BEGIN: probe._replace(phase=jnp.full_like(probe.phase, _END), share=jnp.ones_like(probe.share), low=here),
             _END: self._enclosed(probe, here, crossed),
             _TURN: self._descended(probe, here, rounding),
             _ROOT: _narrowed(probe, here, rounding),
@@ -352,7 +359,8 @@ class _Watch(NamedTuple):
         )
         turn = probe.between(_TURN, probe.low, here)
         turn = turn._replace(share=_bottom(turn.low, turn.high))
-        ahead = _choose(_may_dip(probe.sign, probe.low, here), turn, further)
+        dips = (probe.sign * probe.low.change < 0) & (probe.sign * here.change > 0)
+        ahead = _choose(dips, turn, further)
         root = probe.between(jnp.where(self.counts(probe.sign), _ROOT, _NONE), probe.low, here)
         root = root._replace(share=_inverse(root.low, root.high))
         return _choose(_goes_through(probe.sign, here), root, ahead)
@@ -428,14 +436,16 @@ def _sign_after(start: _Start, value: Scalar) -> Scalar:
     return jnp.where(jnp.isnan(value), 0.0, jnp.where(value == 0, kept, jnp.sign(value)))
 
 
-def _may_dip(sign: Scalar, before: _Sample, after: _Sample) -> Scalar:
-    """Whether a function that keeps its sign heads for zero, turns back, and may be through zero between."""
-    start, end = sign * before.value, sign * after.value
-    falls, rises = sign * before.change, sign * after.change
-    share, rest = falls / (falls - rises), end - start
-    bottom = start + share * (falls + share * (3 * rest - 2 * falls - rises + share * (falls + rises - 2 * rest)))
-    depth = jnp.minimum(start, end) - bottom
-    return (falls < 0) & (rises > 0) & (end > 0) & (bottom <= _MARGIN * depth)
+def _may_turn(start: Scalar, end: Scalar, bend: Scalar) -> Scalar:
+    """Whether a function that keeps its sign, taken as positive, may be through zero between: by the parabola whose
+    slope is less than its chord's by `bend` at the start and more by as much at the end.
+    """
+    twice = jnp.where(bend > 0, 2 * bend, 1.0)
+    share = 0.5 - (end - start) / twice
+    inside = jnp.clip(share, 0.0, 1.0)
+    bottom = start + inside * (end - start) - bend * inside * (1 - inside)
+    near = (share > -_BESIDE) & (share < 1 + _BESIDE)
+    return (bend > 0) & near & (end > 0) & (bottom <= 2 * _MARGIN * bend)
 
 
 def _bottom(low: _Sample, high: _Sample) -> Scalar:
