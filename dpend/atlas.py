@@ -262,7 +262,11 @@ def _orbit(pendulum: Pendulum, row: dict[str, Any]) -> PeriodicOrbit:
 
 
 def _range(name: str, bounds: Any) -> tuple[float, float]:
-    low, high = (known_real(name, bound) for bound in several(name, bounds, "a pair (low, high)", 2))
+    pair = several(name, bounds, "a pair (low, high)", 2)
+    try:
+        low, high = (known_real(name, bound) for bound in pair)
+    except ValueError:
+        raise ValueError(f"{name} must be a pair (low, high) of numbers, got {shown(bounds)}: give two") from None
     if not low <= high:
         raise ValueError(
             f"{name} must be a pair (low, high) with low at most high, got {shown(bounds)}: give them in order"

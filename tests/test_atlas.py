@@ -188,7 +188,7 @@ def test_traced_requests_are_refused(paper):
         (Pendulum(), {"max_period": 15.8}, "max_period must be so short that most_steps, 3e.08, are enough"),
         (Pendulum(), {"most_steps": 1000}, "max_period must be so short that most_steps, 1000, are enough"),
         (Pendulum(), {"most_steps": np.nan}, "most_steps must be a finite positive number"),
-        (Pendulum(), {"most_steps": True}, "most_steps must be a number"),
+        (Pendulum(), {"most_steps": True}, "most_steps must be a finite positive number, got True"),
         (Pendulum(m1=1e300), {}, "m1 and m2 must be within a factor of 1e30"),
         (Pendulum(m2=1e-300), {}, "m1 and m2 must be within a factor of 1e30"),
         (Pendulum(l2=1e-300), {}, "l1 and l2 must be within a factor of 1e12"),

@@ -102,7 +102,7 @@ NUMBER = r"[+-]?\d+\.?\d*(?:e[+-]?\d+)?"
 def assert_shown(shown, out):
     """The shown lines begin the output: words as they are, numbers to their last place, errors of rounding as such."""
     for ours, theirs in zip(shown.splitlines(), out.splitlines(), strict=False):
-        assert re.sub(NUMBER, "#", ours) == re.sub(NUMBER, "#", theirs)
+        assert re.sub(NUMBER, "#", ours.rstrip()) == re.sub(NUMBER, "#", theirs.rstrip())
         for a, b in zip(re.findall(NUMBER, ours), re.findall(NUMBER, theirs), strict=True):
             place = 10.0 ** -len(a.partition("e")[0].partition(".")[2])
             assert abs(float(a) - float(b)) <= 2 * place if "e-" not in a else float(b) < 1e-9
