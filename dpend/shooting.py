@@ -273,6 +273,23 @@ def unpacked(table: np.ndarray) -> Corrected:
     return Corrected(*(column.reshape(-1, *_SHAPES.get(name, ())) for name, column in fields))
 
 
+# L and U in one matrix, and the order of the rows: what `lax.linalg.lu` has found already, and `lu_solve` finds anew.
+_Factors = tuple[Array, Array]
+
+
+def _solve(factors: _Factors, right: Array) -> Array:
+    lu, order = factors
+    half = lax.linalg.triangular_solve(lu, right[order], left_side=True, lower=True, unit_diagonal=True)
+    return lax.linalg.triangular_solve(lu, half, left_side=True)
+
+
+def _solve_transposed(factors: _Factors, right: Array) -> Array:
+    lu, order = factors
+    half = lax.linalg.triangular_solve(lu, right, left_side=True, transpose_a=True)
+    whole = lax.linalg.triangular_solve(lu, half, left_side=True, lower=True, unit_diagonal=True, transpose_a=True)
+    return jnp.zeros_like(right).at[order].set(whole)
+
+
 class _Newton(NamedTuple):
     point: Array
     iterations: Scalar
@@ -284,7 +301,7 @@ class _Newton(NamedTuple):
     null: Array
     side: Scalar
     equations: _Equations
-    factors: tuple[Array, Array]  # of the bordered Jacobian
+    factors: _Factors  # of the bordered Jacobian
 
 
 def _rounding(point: Array, arc: Arc) -> Array:
@@ -303,7 +320,7 @@ def _errors(n: _Newton, tangent: Array, time: Array, arc: Arc) -> Array:
     infinite, its curvature does.
     """
     wanted = jnp.stack([jnp.eye(UNKNOWNS)[0], jnp.eye(UNKNOWNS)[1], time])
-    pulled = jax.scipy.linalg.lu_solve(n.factors, wanted.T, trans=1).T * _rounding(n.point, arc)
+    pulled = _solve_transposed(n.factors, wanted.T).T * _rounding(n.point, arc)
     off = jnp.sqrt(jnp.sum(pulled[0] ** 2))
     slope = jnp.maximum(jnp.maximum(jnp.abs(tangent[0]), jnp.sqrt(off)), jnp.finfo(float).tiny)
     along = (wanted[1:] @ tangent / slope * jnp.where(tangent[0] < 0, -1.0, 1.0))[:, None]
@@ -330,9 +347,9 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
         equations = _equations(pendulum, n.point, jnp.where(estimating, 2 * steps, steps), arc)
         bordered = jnp.concatenate([equations.jacobian, row[None]])
         short = jnp.append(equations.value, row @ (n.point - predicted))
-        factors, pivots = jax.scipy.linalg.lu_factor(bordered)
+        factors, pivots, order = lax.linalg.lu(bordered)
         one = jnp.zeros(UNKNOWNS).at[-1].set(1.0)
-        update, null = jax.scipy.linalg.lu_solve((factors, pivots), jnp.stack([-short, one], axis=1)).T
+        update, null = _solve((factors, order), jnp.stack([-short, one], axis=1)).T
         swaps = jnp.sum(pivots != jnp.arange(UNKNOWNS, dtype=pivots.dtype)) % 2
         side = jnp.prod(jnp.sign(jnp.diagonal(factors))) * jnp.where(swaps == 0, 1.0, -1.0)
         size = jnp.max(jnp.abs(update) / unit)
@@ -344,7 +361,7 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
         return _Newton(
             jnp.where(estimating, n.point, n.point + update), iterations, jnp.where(estimating, n.size, size),
             jnp.where(n.iterations == 0, size, n.first), contraction, done, update, null, side, equations,
-            (factors, pivots),
+            (factors, order),
         )  # fmt: skip
 
     def running(n: _Newton) -> Scalar:
