@@ -12,7 +12,7 @@ there at t = 0 has the sign that it takes when it leaves; what is still on its w
 crosses at the end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -38,6 +38,8 @@ _MARGIN, _BESIDE = 0.05, 0.3
 # Steps that are kept to be looked into in one pass. Where all of them disappoint, the next pass begins behind them: so
 # seldom, with two, that a first-flip map does not feel it.
 _SLOTS = 2
+# So near the end of a motion [steps] a crossing is asked whether it lies at the end within rounding.
+_NEAR_END = 1e-3
 # A step that crosses in the motion and not when taken again (the circle forms then begin on their circle) is lengthened
 # by this share of itself.
 _BEYOND = 1 / 64
@@ -61,13 +63,14 @@ class Crossing(NamedTuple):
 
 class _Start(NamedTuple):
     """A function at a step's start: its sign, its value, its change over the step at the rate there,
-    roughly; and whether the step changes its sign.
+    roughly; whether the step changes its sign, and whether it is to be followed there.
     """
 
     sign: Scalar
     value: Scalar
     change: Scalar
     crossed: Scalar
+    suspect: Scalar
 
 
 class _Step(NamedTuple):
@@ -108,9 +111,10 @@ class _Pass(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """A function to follow in a step, and the phase in which that begins."""
+    """A function to follow in a step, if it is `open`, and the phase in which that begins."""
 
-    index: Scalar
+    function: Scalar
+    open: Scalar
     phase: Scalar
     before: State
     time: Scalar
@@ -204,8 +208,7 @@ def _first_crossing(functions, pendulum, state, duration, scheme, direction):  #
         # Where the slots do not hold all that there is to look into, a further pass may be needed.
         more = search.closed | (search.count == _SLOTS)
         none = Crossing(last.crossing.time + jnp.inf, search.state, jnp.asarray(-1), search.steps)
-        tasks = _tasks(search, more, duration, step)
-        crossing, _ = lax.scan(partial(watch.settle, duration), none, tasks)
+        crossing = watch.settle(_tasks(search, more, duration, step), none, duration)
         times = [jnp.where(search.count > i, jnp.abs(slot.time), 0.0) for i, slot in enumerate(search.slots)]
         return _Pass(jnp.max(jnp.stack(times)), more & (crossing.which < 0), crossing)
 
@@ -214,35 +217,40 @@ def _first_crossing(functions, pendulum, state, duration, scheme, direction):  #
     return lax.while_loop(lambda last: last.again, attempt, first).crossing
 
 
-def _tasks(search: _Search, more: Scalar, duration: float, step: float) -> _Task:
+def _tasks(search: _Search, more: Scalar, duration: float, step: float) -> list[_Task]:
     """All functions in the steps to look into, then all in the step that begins at the end."""
     tasks = []
     for slot in search.slots:
-        for index, start in enumerate(slot.starts):
+        for function, start in enumerate(slot.starts):
             phase = jnp.where(start.crossed, _END, _BEGIN)
-            phase = jnp.where((start.sign != 0) & (slot.dt != 0), phase, _NONE)
-            tasks.append(_Task(jnp.asarray(index), phase, slot.before, slot.time, slot.dt, start))
+            place = slot.before, slot.time, slot.dt
+            tasks.append(_Task(jnp.asarray(function), start.suspect, phase, *place, start))
     functions = zip(search.signs, search.values, search.rates, strict=True)
-    for index, (sign, value, rate) in enumerate(functions):
-        phase = jnp.where(more | (sign == 0), _NONE, _ARRIVE)
-        start = _Start(sign, value, rate * step, sign > 2)
-        beyond = jnp.asarray(duration + step), jnp.asarray(step)
-        tasks.append(_Task(jnp.asarray(index), phase, search.state, *beyond, start))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
+    for function, (sign, value, rate) in enumerate(functions):
+        start = _Start(sign, value, rate * step, sign > 2, sign > 2)
+        is_near = ~more & (jnp.abs(value) <= _NEAR_END * jnp.abs(start.change))
+        place = search.state, jnp.asarray(duration + step), jnp.asarray(step)
+        tasks.append(_Task(jnp.asarray(function), is_near, jnp.full_like(more, _ARRIVE, int), *place, start))
+    return tasks
 
 
 def _choose(condition: Scalar, this: Any, other: Any) -> Any:
     return jax.tree.map(partial(jnp.where, condition), this, other)
 
 
+def _pick(items: Sequence[Any], index: Scalar) -> Any:
+    """items[index] by selections, which many lanes take side by side."""
+    return reduce(lambda other, i: _choose(index == i, items[i], other), range(1, len(items)), items[0])
+
+
 class _Measure(NamedTuple):
-    """The functions at a state, shape (functions,): values, changes over one whole step at the rate
-    there, and what rounding leaves uncertain of the values.
+    """A function at a state: its value, its change over one whole step at the rate there, and what rounding leaves
+    uncertain of the value.
     """
 
-    value: jax.Array
-    change: jax.Array
-    rounding: jax.Array
+    value: Scalar
+    change: Scalar
+    rounding: Scalar
 
 
 class _Watch(NamedTuple):
@@ -257,14 +265,17 @@ class _Watch(NamedTuple):
         leaves = jax.tree.leaves(self.functions(self.pendulum, state))
         return tuple(jnp.asarray(leaf, jnp.float64) for leaf in leaves)
 
-    def measure(self, state: State, dt: Scalar) -> _Measure:
+    def measure(self, state: State, dt: Scalar) -> list[_Measure]:
         """The functions against a step of `dt` [s]."""
-        gradients = [jnp.stack(jax.tree.leaves(row)) for row in jax.jacfwd(self.values)(state)]
-        table = jnp.stack(gradients)  # functions, leaves of the state
-        move = dt * jnp.stack(jax.tree.leaves(vector_field(self.pendulum, state)))
-        size = jnp.abs(jnp.stack(jax.tree.leaves(state))) + jnp.abs(move)
-        rounding = _EPSILON * jnp.sum(jnp.abs(table) * size, axis=1)
-        return _Measure(jnp.stack(self.values(state)), jnp.sum(table * move, axis=1), rounding)
+        moves = [dt * slope for slope in jax.tree.leaves(vector_field(self.pendulum, state))]
+        sizes = [jnp.abs(x) + jnp.abs(move) for x, move in zip(jax.tree.leaves(state), moves, strict=True)]
+        measures = []
+        for value, gradient in zip(self.values(state), jax.jacfwd(self.values)(state), strict=True):
+            parts = jax.tree.leaves(gradient)
+            change = sum(part * move for part, move in zip(parts, moves, strict=True))
+            rounding = _EPSILON * sum(jnp.abs(part) * size for part, size in zip(parts, sizes, strict=True))
+            measures.append(_Measure(value, change, rounding))
+        return measures
 
     def counts(self, sign: Scalar) -> Scalar:
         """Whether a change from this sign is one that is asked for."""
@@ -272,31 +283,35 @@ class _Watch(NamedTuple):
 
     def start(self, state: State, step: float) -> _Search:
         """The search at its start. What lies on zero has the sign of its rate."""
-        here = self.measure(state, step)
-        zero = _ROUNDING * here.rounding
-        leaves = jnp.where(jnp.abs(here.change) > zero, jnp.sign(here.change), 0.0)
-        table = jnp.where(jnp.abs(here.value) > zero, jnp.sign(here.value), leaves)
-        values, rates, signs = tuple(here.value), tuple(here.change / step), tuple(table)
+        values, rates, signs = [], [], []
+        for here in self.measure(state, step):
+            zero = _ROUNDING * here.rounding
+            leaves = jnp.where(jnp.abs(here.change) > zero, jnp.sign(here.change), 0.0)
+            signs.append(jnp.where(jnp.abs(here.value) > zero, jnp.sign(here.value), leaves))
+            values.append(here.value)
+            rates.append(here.change / step)
         nothing = jnp.zeros_like(state.theta1)
-        starts = tuple(_Start(sign, nothing, nothing, sign > 2) for sign in signs)
+        starts = tuple(_Start(sign, nothing, nothing, sign > 2, sign > 2) for sign in signs)
         slots = (_Step(state, nothing, nothing, starts),) * _SLOTS
-        return _Search(values, rates, signs, nothing, state, slots, jnp.asarray(0), nothing > 0, nothing)
+        return _Search(
+            tuple(values), tuple(rates), tuple(signs), nothing, state, slots, jnp.asarray(0), nothing > 0, nothing
+        )
 
     def look(self, floor: Scalar, search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
         """The `update` of `fold` that notes the steps to look into."""
         values, mean = self.values(state), dt / (search.dt + dt)
-        starts, rates, changes, turns = [], [], [], []
+        starts, rates, changes = [], [], []
         for sign, before, rate, value in zip(search.signs, search.values, search.rates, values, strict=True):
             move = value - before
-            # Twice what the parabola adds to its chord's slope at the end, and takes from it at the start.
+            # What the parabola adds to its chord's slope at the end, and takes from it at the start.
             bend = mean * (move - dt * rate)
             crossed = _goes_through(sign, _Sample(1.0, value, move + bend))
-            starts.append(_Start(sign, before, move - bend, crossed))
-            rates.append(move / dt)
             changes.append(crossed & self.counts(sign))
-            turns.append(_may_turn(sign * before, sign * value, sign * bend))
+            suspect = changes[-1] | _may_turn(sign * before, sign * value, sign * bend)
+            starts.append(_Start(sign, before, move - bend, crossed, suspect))
+            rates.append(move / dt)
         closes = reduce(jnp.logical_or, changes)
-        wanted = (closes | reduce(jnp.logical_or, turns)) & (jnp.abs(time) > floor)
+        wanted = reduce(jnp.logical_or, [start.suspect for start in starts]) & (jnp.abs(time) > floor)
         take = wanted & ~search.closed & (search.count < _SLOTS)
         step = _Step(search.state, time, dt, tuple(starts))
         slots = tuple(_choose(take & (search.count == i), step, slot) for i, slot in enumerate(search.slots))
@@ -304,29 +319,34 @@ class _Watch(NamedTuple):
         count, closed = search.count + take.astype(int), search.closed | (take & closes)
         return _Search(values, tuple(rates), signs, dt, state, slots, count, closed, search.steps + 1.0)
 
-    def settle(self, duration: float, crossing: Crossing, task: _Task) -> tuple[Crossing, None]:
-        """The crossing of a task, if it is earlier than the one known."""
+    def settle(self, tasks: list[_Task], none: Crossing, duration: float) -> Crossing:
+        """The earliest crossing of all tasks. Each lane goes through its own, one after the other."""
         unit = self.scheme.constants(self.pendulum)
-        point = self.scheme.enter(self.pendulum, task.before)
 
-        def once(carry: tuple[_Probe, State]) -> tuple[_Probe, State]:
-            probe, _ = carry
+        def after(index: Scalar, crossing: Crossing) -> tuple[Scalar, _Probe]:
+            """The next task that can give an earlier crossing."""
+            ahead = jnp.full_like(index, len(tasks))
+            for i, task in reversed(list(enumerate(tasks))):
+                is_early = jnp.abs(task.time - task.dt) < jnp.abs(crossing.time)
+                ahead = jnp.where((i > index) & task.open & is_early, i, ahead)
+            return ahead, _first_probe(_pick(tasks, ahead))
+
+        def once(work: tuple[Scalar, _Probe, Crossing]) -> tuple[Scalar, _Probe, Crossing]:
+            index, probe, crossing = work
+            task = _pick(tasks, index)
+            point = self.scheme.enter(self.pendulum, task.before)
             state = self.scheme.leave(unit, self.scheme.move(self.scheme.lasting(unit, probe.share * task.dt), point))
-            measure = jax.tree.map(lambda leaf: leaf[task.index], self.measure(state, task.dt))
+            measure = _pick(self.measure(state, task.dt), task.function)
             here = _Sample(probe.share, measure.value, measure.change)
-            return self._follow(probe, here, measure.rounding, task.start.crossed), state
+            time = _within(duration, task.time + (probe.share - 1.0) * task.dt)
+            probe = self._follow(probe, here, measure.rounding, task.start.crossed)
+            earlier = (probe.phase == _FOUND) & (jnp.abs(time) < jnp.abs(crossing.time))
+            crossing = _choose(earlier, Crossing(time, state, task.function, crossing.steps), crossing)
+            is_done = (probe.phase >= _FOUND) | (probe.count >= _MOST_ITERATIONS)
+            return *_choose(is_done, after(index, crossing), (index, probe)), crossing
 
-        def goes_on(carry: tuple[_Probe, State]) -> Scalar:
-            return (carry[0].phase < _FOUND) & (carry[0].count < _MOST_ITERATIONS)
-
-        early = jnp.abs(task.time - task.dt) < jnp.abs(crossing.time)
-        first = _first_probe(task)._replace(phase=jnp.where(early, task.phase, _NONE))
-        probe, state = lax.while_loop(goes_on, once, (first, task.before))
-        time = task.time + (probe.share - 1.0) * task.dt
-        nearest = jnp.sign(duration) * jnp.minimum(jnp.abs(time), abs(duration))
-        time = time + lax.stop_gradient(nearest - time)
-        earlier = (probe.phase == _FOUND) & (jnp.abs(time) < jnp.abs(crossing.time))
-        return _choose(earlier, Crossing(time, state, task.index, crossing.steps), crossing), None
+        first = after(jnp.full_like(none.which, -1), none)
+        return lax.while_loop(lambda work: work[0] < len(tasks), once, (*first, none))[2]
 
     def _follow(self, probe: _Probe, here: _Sample, rounding: Scalar, crossed: Scalar) -> _Probe:
         """The probe after one more try, which is `here`."""
@@ -388,11 +408,17 @@ class _Watch(NamedTuple):
 
 
 def _first_probe(task: _Task) -> _Probe:
-    start = task.start
-    low = _Sample(jnp.zeros_like(start.value), start.value, start.change)
-    share = jnp.where(task.phase == _END, jnp.ones_like(start.value), 0.0)
+    start, one = task.start, jnp.ones_like(task.start.value)
+    low = _Sample(0.0 * one, start.value, start.change)
+    share = jnp.where(task.phase == _END, one, 0.0)
     largest = jnp.maximum(jnp.abs(start.value), _EPSILON * jnp.abs(start.change))
-    return _Probe(task.phase, share, low, low, start.sign, jnp.ones_like(share), largest, jnp.asarray(0))
+    return _Probe(task.phase, share, low, low, start.sign, one, largest, jnp.zeros_like(task.phase))
+
+
+def _within(duration: float, time: Scalar) -> Scalar:
+    """A time that rounding may have put behind the end, and its derivative."""
+    nearest = jnp.sign(duration) * jnp.minimum(jnp.abs(time), abs(duration))
+    return time + lax.stop_gradient(nearest - time)
 
 
 def _narrowed(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
