@@ -221,16 +221,16 @@ def _tasks(search: _Search, more: Scalar, duration: float, step: float) -> list[
     """All functions in the steps to look into, then all in the step that begins at the end."""
     tasks = []
     for slot in search.slots:
-        for function, start in enumerate(slot.starts):
+        for index, start in enumerate(slot.starts):
             phase = jnp.where(start.crossed, _END, _BEGIN)
             place = slot.before, slot.time, slot.dt
-            tasks.append(_Task(jnp.asarray(function), start.suspect, phase, *place, start))
+            tasks.append(_Task(jnp.asarray(index), start.suspect, phase, *place, start))
     functions = zip(search.signs, search.values, search.rates, strict=True)
-    for function, (sign, value, rate) in enumerate(functions):
+    for index, (sign, value, rate) in enumerate(functions):
         start = _Start(sign, value, rate * step, sign > 2, sign > 2)
         is_near = ~more & (jnp.abs(value) <= _NEAR_END * jnp.abs(start.change))
         place = search.state, jnp.asarray(duration + step), jnp.asarray(step)
-        tasks.append(_Task(jnp.asarray(function), is_near, jnp.full_like(more, _ARRIVE, int), *place, start))
+        tasks.append(_Task(jnp.asarray(index), is_near, jnp.full_like(more, _ARRIVE, int), *place, start))
     return tasks
 
 
