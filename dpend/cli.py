@@ -267,8 +267,8 @@ def atlas(
     return 0 if solved and not (found.coverage.suspicious_cells or found.coverage.exhausted) else 1
 
 
-# A search that is expected to take longer says so before it begins [s].
-_LONG = 60.0
+# What is told before it is spent: more seconds, or bytes.
+_LONG, _LARGE = 60.0, 1e9
 
 
 def _tell_cost(pendulum: Pendulum, max_period: float, theta1: float | None, most_steps: float) -> None:
@@ -636,10 +636,6 @@ _MAPS = {
 
 # Along a map's side: sixteen times what a large map has; beyond it lies a slip of the finger.
 _MOST_CELLS = 65536
-
-
-# What is told before it is spent: more seconds, or bytes.
-_LONG, _LARGE = 60.0, 1e9
 
 
 def _announce(cost: Cost) -> None:
