@@ -21,9 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from dpend.checks import function, known_number, one_of
-from dpend.pendulum import Pendulum, Scalar, State, check_motion, vector_field
-from dpend.steppers import Scheme, check_scheme
+from dpend.pendulum import Pendulum, Scalar, State, vector_field
+from dpend.steppers import Scheme
 from dpend.trajectory import fold
 
 # Newton's method takes three or four; a jump, which is bisected to the last bit, some 60.
@@ -35,9 +34,6 @@ _ROUNDING = 8.0
 # this share of the difference of its slopes at the step's ends; a swing is as deep there as 1/8. Its
 # error is some (omega h)/2 of that for a swing of frequency omega: it is seen up to omega h = 0.8.
 _MARGIN, _BESIDE = 0.05, 0.3
-# Steps that are kept to be looked into in one pass. Where all of them disappoint, the next pass begins behind them: so
-# seldom, with two, that a first-flip map does not feel it.
-_SLOTS = 2
 # So near the end of a motion [steps] a crossing is asked whether it lies at the end within rounding.
 _NEAR_END = 1e-3
 # A step that crosses in the motion and not when taken again (the circle forms then begin on their circle) is lengthened
@@ -61,25 +57,15 @@ class Crossing(NamedTuple):
     steps: Scalar
 
 
-class _Start(NamedTuple):
-    """A function at a step's start: its sign, its value, its change over the step at the rate there,
-    roughly; whether the step changes its sign, and whether it is to be followed there.
-    """
-
-    sign: Scalar
-    value: Scalar
-    change: Scalar
-    crossed: Scalar
-    suspect: Scalar
-
-
 class _Step(NamedTuple):
-    """A step to look into: the state before it, its end and length [s], and every function."""
+    """A step to look into: the state before it, its end and length [s], and of each function the sign
+    at its start, doubled if it changes in the step; zero if there is nothing to look for.
+    """
 
     before: State
     time: Scalar
     dt: Scalar
-    starts: tuple[_Start, ...]
+    marks: tuple[Scalar, ...]
 
 
 class _Search(NamedTuple):
@@ -87,8 +73,8 @@ class _Search(NamedTuple):
 
     `values` and `signs` are those of the functions after the last step, of `dt`, and `rates` [1/s]
     their mean ones in it; a sign is zero as long as there is none. They are scalars: XLA computes
-    those of many lanes side by side, and arrays of a few numbers not. `closed`: the last of the slots
-    changes a sign, so that no later step is asked for.
+    those of many lanes side by side, and arrays of a few numbers not. `step` is the first one to look
+    into, once `taken`.
     """
 
     values: tuple[Scalar, ...]
@@ -96,9 +82,8 @@ class _Search(NamedTuple):
     signs: tuple[Scalar, ...]
     dt: Scalar
     state: State
-    slots: tuple[_Step, ...]
-    count: Scalar
-    closed: Scalar
+    step: _Step
+    taken: Scalar
     steps: Scalar
 
 
@@ -111,7 +96,9 @@ class _Pass(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """A function to follow in a step, if it is `open`, and the phase in which that begins."""
+    """A function to follow in a step, if it is `open`, the phase in which that begins, its sign at the
+    start, and whether the step changes it.
+    """
 
     function: Scalar
     open: Scalar
@@ -119,7 +106,8 @@ class _Task(NamedTuple):
     before: State
     time: Scalar
     dt: Scalar
-    start: _Start
+    sign: Scalar
+    crossed: Scalar
 
 
 # What a probe does next: see whether it is at zero before the step, try the step's start, its end, look
@@ -156,13 +144,13 @@ class _Probe(NamedTuple):
 
 
 def first_crossing(
-    functions: Callable[[Pendulum, State], Any] | Any,
-    pendulum: Pendulum | Any,
-    state: State | Any,
-    duration: float | Any,
-    scheme: Scheme | Any,
+    functions: Callable[[Pendulum, State], Any],
+    pendulum: Pendulum,
+    state: State,
+    duration: float,
+    scheme: Scheme,
     *,
-    direction: int | Any = 0,
+    direction: int = 0,
 ) -> Crossing:
     """The first time 0 < t <= duration at which one of `functions` changes sign continuously.
 
@@ -189,11 +177,9 @@ def first_crossing(
     Raises:
         ValueError: direction is none of these; as `flow`.
     """
-    function("functions", functions, "(pendulum, state)", "lambda pendulum, state: state.theta2")
-    check_motion(pendulum, state)
-    check_scheme(scheme)
-    duration, direction = known_number("duration", duration, unit="s"), one_of("direction", direction, (-1, 0, 1))
-    return _first_crossing(functions, pendulum, state, duration, scheme, direction)
+    if direction not in (-1, 0, 1):
+        raise ValueError(f"direction must be -1, 0 or 1, got {direction!r}")
+    return _first_crossing(functions, pendulum, state, float(duration), scheme, direction)
 
 
 @partial(jax.jit, static_argnames=("functions", "duration", "scheme", "direction"))
@@ -205,32 +191,30 @@ def _first_crossing(functions, pendulum, state, duration, scheme, direction):  #
 
     def attempt(last: _Pass) -> _Pass:
         search = fold(partial(watch.look, last.floor), start, pendulum, state, duration, scheme)
-        # Where the slots do not hold all that there is to look into, a further pass may be needed.
-        more = search.closed | (search.count == _SLOTS)
         none = Crossing(last.crossing.time + jnp.inf, search.state, jnp.asarray(-1), search.steps)
-        crossing = watch.settle(_tasks(search, more, duration, step), none, duration)
-        times = [jnp.where(search.count > i, jnp.abs(slot.time), 0.0) for i, slot in enumerate(search.slots)]
-        return _Pass(jnp.max(jnp.stack(times)), more & (crossing.which < 0), crossing)
+        crossing = watch.settle(_tasks(search, duration, step), none, duration)
+        # A step that disappoints leaves all that comes after it to the next pass.
+        return _Pass(jnp.abs(search.step.time), search.taken & (crossing.which < 0), crossing)
 
     zero = jnp.zeros_like(state.theta1)
     first = _Pass(zero, zero == 0, Crossing(zero, state, jnp.asarray(-1), zero))
     return lax.while_loop(lambda last: last.again, attempt, first).crossing
 
 
-def _tasks(search: _Search, more: Scalar, duration: float, step: float) -> list[_Task]:
-    """All functions in the steps to look into, then all in the step that begins at the end."""
+def _tasks(search: _Search, duration: float, step: float) -> list[_Task]:
+    """All functions in the step to look into; where there is none, in the step that begins at the end."""
     tasks = []
-    for slot in search.slots:
-        for index, start in enumerate(slot.starts):
-            phase = jnp.where(start.crossed, _END, _BEGIN)
-            place = slot.before, slot.time, slot.dt
-            tasks.append(_Task(jnp.asarray(index), start.suspect, phase, *place, start))
+    place = search.step.before, search.step.time, search.step.dt
+    for function, mark in enumerate(search.step.marks):
+        phase = jnp.full_like(search.taken, _BEGIN, int)
+        crossed = jnp.abs(mark) > 1
+        tasks.append(_Task(jnp.asarray(function), mark != 0, phase, *place, jnp.sign(mark), crossed))
+    place = search.state, jnp.asarray(duration + step), jnp.asarray(step)
     functions = zip(search.signs, search.values, search.rates, strict=True)
-    for index, (sign, value, rate) in enumerate(functions):
-        start = _Start(sign, value, rate * step, sign > 2, sign > 2)
-        is_near = ~more & (jnp.abs(value) <= _NEAR_END * jnp.abs(start.change))
-        place = search.state, jnp.asarray(duration + step), jnp.asarray(step)
-        tasks.append(_Task(jnp.asarray(index), is_near, jnp.full_like(more, _ARRIVE, int), *place, start))
+    for function, (sign, value, rate) in enumerate(functions):
+        is_near = ~search.taken & (jnp.abs(value) <= _NEAR_END * jnp.abs(step * rate))
+        phase = jnp.full_like(search.taken, _ARRIVE, int)
+        tasks.append(_Task(jnp.asarray(function), is_near, phase, *place, sign, jnp.zeros_like(is_near)))
     return tasks
 
 
@@ -291,33 +275,26 @@ class _Watch(NamedTuple):
             values.append(here.value)
             rates.append(here.change / step)
         nothing = jnp.zeros_like(state.theta1)
-        starts = tuple(_Start(sign, nothing, nothing, sign > 2, sign > 2) for sign in signs)
-        slots = (_Step(state, nothing, nothing, starts),) * _SLOTS
-        return _Search(
-            tuple(values), tuple(rates), tuple(signs), nothing, state, slots, jnp.asarray(0), nothing > 0, nothing
-        )
+        before = _Step(state, nothing, nothing, (nothing,) * len(signs))
+        return _Search(tuple(values), tuple(rates), tuple(signs), nothing, state, before, nothing > 0, nothing)
 
     def look(self, floor: Scalar, search: _Search, time: Scalar, dt: Scalar, state: State) -> _Search:
         """The `update` of `fold` that notes the steps to look into."""
         values, mean = self.values(state), dt / (search.dt + dt)
-        starts, rates, changes = [], [], []
+        marks, rates, signs = [], [], []
         for sign, before, rate, value in zip(search.signs, search.values, search.rates, values, strict=True):
             move = value - before
             # What the parabola adds to its chord's slope at the end, and takes from it at the start.
             bend = mean * (move - dt * rate)
             crossed = _goes_through(sign, _Sample(1.0, value, move + bend))
-            changes.append(crossed & self.counts(sign))
-            suspect = changes[-1] | _may_turn(sign * before, sign * value, sign * bend)
-            starts.append(_Start(sign, before, move - bend, crossed, suspect))
+            turns = _may_turn(sign * before, sign * value, sign * bend)
+            marks.append(jnp.where(crossed & self.counts(sign), 2 * sign, jnp.where(turns, sign, 0.0)))
             rates.append(move / dt)
-        closes = reduce(jnp.logical_or, changes)
-        wanted = reduce(jnp.logical_or, [start.suspect for start in starts]) & (jnp.abs(time) > floor)
-        take = wanted & ~search.closed & (search.count < _SLOTS)
-        step = _Step(search.state, time, dt, tuple(starts))
-        slots = tuple(_choose(take & (search.count == i), step, slot) for i, slot in enumerate(search.slots))
-        signs = tuple(_sign_after(start, value) for start, value in zip(starts, values, strict=True))
-        count, closed = search.count + take.astype(int), search.closed | (take & closes)
-        return _Search(values, tuple(rates), signs, dt, state, slots, count, closed, search.steps + 1.0)
+            signs.append(_sign_after(jnp.where(crossed, -sign, sign), value))
+        wanted = reduce(jnp.logical_or, [mark != 0 for mark in marks]) & (jnp.abs(time) > floor)
+        take = wanted & ~search.taken
+        step = _choose(take, _Step(search.state, time, dt, tuple(marks)), search.step)
+        return _Search(values, tuple(rates), tuple(signs), dt, state, step, search.taken | take, search.steps + 1.0)
 
     def settle(self, tasks: list[_Task], none: Crossing, duration: float) -> Crossing:
         """The earliest crossing of all tasks. Each lane goes through its own, one after the other."""
@@ -336,10 +313,12 @@ class _Watch(NamedTuple):
             task = _pick(tasks, index)
             point = self.scheme.enter(self.pendulum, task.before)
             state = self.scheme.leave(unit, self.scheme.move(self.scheme.lasting(unit, probe.share * task.dt), point))
+            state = lax.optimization_barrier(state)
             measure = _pick(self.measure(state, task.dt), task.function)
+            measure = lax.optimization_barrier(measure)
             here = _Sample(probe.share, measure.value, measure.change)
             time = _within(duration, task.time + (probe.share - 1.0) * task.dt)
-            probe = self._follow(probe, here, measure.rounding, task.start.crossed)
+            probe = self._follow(probe, here, measure.rounding, task.crossed)
             earlier = (probe.phase == _FOUND) & (jnp.abs(time) < jnp.abs(crossing.time))
             crossing = _choose(earlier, Crossing(time, state, task.function, crossing.steps), crossing)
             is_done = (probe.phase >= _FOUND) | (probe.count >= _MOST_ITERATIONS)
@@ -352,7 +331,7 @@ class _Watch(NamedTuple):
         """The probe after one more try, which is `here`."""
         phases = {
             _ARRIVE: self._arrived(probe, here, rounding),
-            _BEGIN: probe._replace(phase=jnp.full_like(probe.phase, _END), share=jnp.ones_like(probe.share), low=here),
+            _BEGIN: _begun(probe, here, rounding),
             _END: self._enclosed(probe, here, crossed),
             _TURN: self._descended(probe, here, rounding),
             _ROOT: _narrowed(probe, here, rounding),
@@ -367,7 +346,7 @@ class _Watch(NamedTuple):
         zero = _ROUNDING * rounding
         arrives = (jnp.abs(here.value) <= zero) & (probe.sign * here.change < -zero) & self.counts(probe.sign)
         share = here.share - here.value / jnp.where(arrives, here.change, 1.0)
-        return probe._replace(phase=jnp.where(arrives, _LAST, _NONE), share=share)
+        return probe._replace(phase=jnp.where(arrives, _LAST, _NONE), share=share, largest=zero)
 
     def _enclosed(self, probe: _Probe, here: _Sample, crossed: Scalar) -> _Probe:
         """After the step's end: a bracket of a change of sign, or of a turn before one, or the end of it."""
@@ -408,11 +387,15 @@ class _Watch(NamedTuple):
 
 
 def _first_probe(task: _Task) -> _Probe:
-    start, one = task.start, jnp.ones_like(task.start.value)
-    low = _Sample(0.0 * one, start.value, start.change)
-    share = jnp.where(task.phase == _END, one, 0.0)
-    largest = jnp.maximum(jnp.abs(start.value), _EPSILON * jnp.abs(start.change))
-    return _Probe(task.phase, share, low, low, start.sign, one, largest, jnp.zeros_like(task.phase))
+    zero = jnp.zeros_like(task.sign)
+    nothing = _Sample(zero, zero, zero)
+    return _Probe(task.phase, zero, nothing, nothing, task.sign, zero + 1, zero, jnp.zeros_like(task.phase))
+
+
+def _begun(probe: _Probe, here: _Sample, rounding: Scalar) -> _Probe:
+    largest = jnp.maximum(jnp.abs(here.value), rounding)
+    phase, share = jnp.full_like(probe.phase, _END), jnp.ones_like(probe.share)
+    return probe._replace(phase=phase, share=share, low=here, largest=largest)
 
 
 def _within(duration: float, time: Scalar) -> Scalar:
@@ -456,10 +439,11 @@ def _goes_through(sign: Scalar, after: _Sample) -> Scalar:
     return (sign * after.value < 0) | ((after.value == 0) & (sign * after.change < 0))
 
 
-def _sign_after(start: _Start, value: Scalar) -> Scalar:
-    """A function that is not a number loses its sign: what it does next is a new start."""
-    kept = jnp.where(start.crossed, -start.sign, start.sign)
-    return jnp.where(jnp.isnan(value), 0.0, jnp.where(value == 0, kept, jnp.sign(value)))
+def _sign_after(sign: Scalar, value: Scalar) -> Scalar:
+    """The sign of `value`, at zero the one given. A function that is not a number loses its sign: what it does next is
+    a new start.
+    """
+    return jnp.where(jnp.isnan(value), 0.0, jnp.where(value == 0, sign, jnp.sign(value)))
 
 
 def _may_turn(start: Scalar, end: Scalar, bend: Scalar) -> Scalar:
