@@ -147,7 +147,7 @@ class Trajectory:
             if estimate < _PARTED:
                 mends += [f"ask for a tolerance of {1.05 * estimate / _MARGIN:.1e} rad or more"]
         why = "the motion is chaotic, and errors of rounding have grown so far" if chaotic else ""
-        why = why or ("the step is too large" if math.isnan(tolerance) else "no step brings it lower")
+        why = why or ("the step is too large" if math.isnan(tolerance) else "no step that was tried brings it lower")
         mend = " or ".join(mends or ["shorten it"])
         return f"The error estimate, {estimate:.1e} rad, is above {wish}: {why}; {mend}."
 
@@ -508,7 +508,7 @@ def _simulated(pendulum, state, duration, steps, scheme, save_every, room, compa
     wanted = jnp.where(jnp.isnan(tolerance), _PARTED, tolerance)
     growth = compared.floor / _EPS
     regular = _SHEAR * (1.0 + fast_frequency(pendulum) * jnp.abs(duration))
-    chaotic = (growth > regular) & (_ROUNDING * growth > wanted)
+    chaotic = (growth > regular) & (estimate < _NEAR_ROUNDING * compared.floor)
     why = jnp.where(chaotic, Status.BEYOND_HORIZON, Status.TOLERANCE_NOT_REACHED)
     status = jnp.where(estimate > wanted, why, Status.CONVERGED)
     status = jnp.where(drift > drift_tolerance, Status.DRIFT_ABOVE_TOLERANCE, status)
@@ -523,9 +523,9 @@ _simulate_traced = jax.jit(_simulated, static_argnames=("scheme", "room"))
 
 
 _EPS = float(np.finfo(float).eps)
-# Rounding errors of a whole motion are some 30 units in the last place of its start, magnified as such a displacement
-# is, but in one of ten cases more than 100 to 300 (order 8, releases from the whole square, 2 to 10 s).
-_ROUNDING = 256 * _EPS
+# Errors of so many roundings of the start may be those of rounding, of more they are not. Those are of some 30, but in
+# one of ten cases of more than 100 to 300 (order 8, releases from the whole square, 2 to 10 s).
+_NEAR_ROUNDING = 1e4
 # Tangents go along a motion of this method, the only one that carries them at little more than its own cost.
 _GUIDE = "rk8-circle"
 # Estimates of so many roundings of the start may be of rounding alone.
@@ -743,10 +743,10 @@ _MARGIN = 0.8
 _FIRST_TURN = 0.5
 # Below (rate dt)^p of this the truncation of a step is lost in rounding: a smaller step only adds to that.
 _ONLY_ROUNDING = 1e-18
-# Errors of so many roundings of the start may be those of rounding: if then a smaller step does not help, none will.
-_NEAR_ROUNDING = 1e4
 # A motion that keeps its energy this well, in units of its scale, has steps that resolve it.
 _RESOLVED = 1e-10
+# What a rounding grows to is believed where two steps tell it within this factor.
+_ALIKE = 10.0
 
 
 def _scheme_reaching(
@@ -764,7 +764,7 @@ def _scheme_reaching(
             f"duration must be at most some {_FIRST_TURN * most_steps / rate:.1e} s for a tolerance, got {duration:g}, "
             f"which takes {steps:.3g} steps or more: give a shorter one, a step, or more most_steps"
         )
-    best, last, fall, order = None, math.inf, 1.0, Scheme(method, 1.0).order
+    best, last, last_floor, fall, order = None, math.inf, math.inf, 1.0, Scheme(method, 1.0).order
     while True:
         scheme = Scheme(method, abs(duration) / steps)
         dt, count = step_size(duration, steps), jnp.asarray(steps)
@@ -774,12 +774,13 @@ def _scheme_reaching(
         if turn <= _LARGEST_TURN and not (best and best[0] < error):
             best = error, scheme, compared
         near = error < _PARTED  # to the true motion all along, or else at least to its energy
-        lost = floor > tolerance and (near or drift < _RESOLVED)
-        steady = near and error < _NEAR_ROUNDING * floor and error > last * fall
+        alike = last_floor / _ALIKE < floor < _ALIKE * last_floor  # too long a step makes growth of its own
+        lost = alike and floor > tolerance and (near or drift < _RESOLVED)
+        steady = alike and near and error < _NEAR_ROUNDING * floor and error > last * fall
         found = turn <= _LARGEST_TURN and (error <= _MARGIN * tolerance or lost or steady)
         missing = (2 * error / tolerance) ** (1 / order) if math.isfinite(error) else 4.0
         more = min(max(missing, turn, 1.2), 4.0)
-        steps, last, fall = math.ceil(steps * more), error, more ** (-order / 2)
+        steps, last, last_floor, fall = math.ceil(steps * more), error, floor, more ** (-order / 2)
         if found or turn < _ONLY_ROUNDING ** (1 / order) or steps > most_steps:
             return (best or (error, scheme, compared))[1:]
 
