@@ -21,9 +21,10 @@ import numpy as np
 from dpend._runtime import require_float64
 from dpend.checks import known_number, several, shown
 from dpend.measurements import FEWEST, Angles, best_width, checked, local_cubics, wrapped
-from dpend.pendulum import Pendulum, Scalar, State, known_pendulum, momenta, normal_modes
+from dpend.pendulum import Pendulum, Scalar, State, fast_frequency, known_pendulum, momenta, normal_modes
 from dpend.trajectory import Status
 from dpend.windows import (
+    MOST_TURN,
     PRICES,
     ROUNDED,
     Found,
@@ -386,7 +387,7 @@ def fit_parameters(
             increase or are too far apart; arrays of other lengths, infinite, with fewer than 7 angles of a rod, or with
             fewer than there are unknowns; angles that look like degrees; nothing measured at the first time; initial
             values that are no such numbers; noise below 1e-15 or above pi rad; a pendulum with l2/l1 or m2/m1 beyond
-            1e9 or below 1e-9; g zero and free.
+            1e9 or below 1e-9, or whose fast mode is too fast for the samples; g zero and free.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -464,6 +465,7 @@ def _fitted(
     rate = _rate(series, pendulum)
     by_free = np.array([_BY_FIELD[name] for name in free], float).reshape(-1, 3).T
     problem = laid_out(series, pendulum, by_free, np.array([value is not None for value in initial]), rate)
+    _check_fast_mode(pendulum, float(np.max(problem.dts)))
     start = _smoothed(problem, *series, initial, rate)
     expected = sigma or max(start.noise, _LEAST_NOISE)
     seen_at_first = bool(np.all(start.known[:, 0]))
@@ -518,6 +520,16 @@ def _rate(series: Angles, pendulum: Pendulum) -> float:
 _FASTER = 4.0
 # A quarter of a period between samples shows nothing of a swing; a million radians are a slip of the unit.
 _COARSEST, _LONGEST = math.pi / 2, 1e6
+
+
+def _check_fast_mode(pendulum: Pendulum, interval: float) -> None:
+    """Refuses a start whose fast mode takes more integration steps from sample to sample than are ever made."""
+    rate = float(fast_frequency(pendulum))
+    if not rate * interval <= MOST_TURN:
+        raise ValueError(
+            f"pendulum must have a fast mode of at most {MOST_TURN / interval:.3g} rad/s to be followed in intervals "
+            f"of {interval:.3g} s, got {rate:.3g} rad/s: start nearer to what was measured, or give more samples"
+        )
 
 
 def _result(

@@ -465,3 +465,6 @@ def settings_for(
 
 # A motion that asks for more integration steps in an interval is not the one that was measured.
 _MOST_STEPS = 200
+# The fast mode at the start may advance by so much in an interval [rad], in fifty steps: the search for a hidden rod
+# then takes half a minute, and with all of the steps above it took four times as long and found nothing.
+MOST_TURN = 50 * _FINE
