@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from dpend.pendulum import Pendulum, Scalar, State, vector_field
-from dpend.steppers import Scheme
+from dpend.checks import function, known_number, one_of
+from dpend.pendulum import Pendulum, Scalar, State, check_motion, vector_field
+from dpend.steppers import Scheme, check_scheme
 from dpend.trajectory import fold
 
 # Newton's method takes three or four; a jump, which is bisected to the last bit, some 60.
@@ -144,13 +145,13 @@ class _Probe(NamedTuple):
 
 
 def first_crossing(
-    functions: Callable[[Pendulum, State], Any],
-    pendulum: Pendulum,
-    state: State,
-    duration: float,
-    scheme: Scheme,
+    functions: Callable[[Pendulum, State], Any] | Any,
+    pendulum: Pendulum | Any,
+    state: State | Any,
+    duration: float | Any,
+    scheme: Scheme | Any,
     *,
-    direction: int = 0,
+    direction: int | Any = 0,
 ) -> Crossing:
     """The first time 0 < t <= duration at which one of `functions` changes sign continuously.
 
@@ -177,9 +178,11 @@ def first_crossing(
     Raises:
         ValueError: direction is none of these; as `flow`.
     """
-    if direction not in (-1, 0, 1):
-        raise ValueError(f"direction must be -1, 0 or 1, got {direction!r}")
-    return _first_crossing(functions, pendulum, state, float(duration), scheme, direction)
+    function("functions", functions, "(pendulum, state)", "lambda pendulum, state: state.theta2")
+    check_motion(pendulum, state)
+    check_scheme(scheme)
+    duration, direction = known_number("duration", duration, unit="s"), one_of("direction", direction, (-1, 0, 1))
+    return _first_crossing(functions, pendulum, state, duration, scheme, direction)
 
 
 @partial(jax.jit, static_argnames=("functions", "duration", "scheme", "direction"))
@@ -205,16 +208,16 @@ def _tasks(search: _Search, duration: float, step: float) -> list[_Task]:
     """All functions in the step to look into; where there is none, in the step that begins at the end."""
     tasks = []
     place = search.step.before, search.step.time, search.step.dt
-    for function, mark in enumerate(search.step.marks):
+    for index, mark in enumerate(search.step.marks):
         phase = jnp.full_like(search.taken, _BEGIN, int)
         crossed = jnp.abs(mark) > 1
-        tasks.append(_Task(jnp.asarray(function), mark != 0, phase, *place, jnp.sign(mark), crossed))
+        tasks.append(_Task(jnp.asarray(index), mark != 0, phase, *place, jnp.sign(mark), crossed))
     place = search.state, jnp.asarray(duration + step), jnp.asarray(step)
     functions = zip(search.signs, search.values, search.rates, strict=True)
-    for function, (sign, value, rate) in enumerate(functions):
+    for index, (sign, value, rate) in enumerate(functions):
         is_near = ~search.taken & (jnp.abs(value) <= _NEAR_END * jnp.abs(step * rate))
         phase = jnp.full_like(search.taken, _ARRIVE, int)
-        tasks.append(_Task(jnp.asarray(function), is_near, phase, *place, sign, jnp.zeros_like(is_near)))
+        tasks.append(_Task(jnp.asarray(index), is_near, phase, *place, sign, jnp.zeros_like(is_near)))
     return tasks
 
 
