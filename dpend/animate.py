@@ -11,11 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dpend.checks import file_path, function, instance, known_number, shown
-from dpend.files import check_place, replacing
-from dpend.pendulum import Pendulum, State, check_motion, check_pendulum, check_state, fast_frequency, positions
+from dpend.checks import check_place, file_path, function, instance, known_number, shown
+from dpend.mechanics.pendulum import (
+    Pendulum,
+    State,
+    check_motion,
+    check_pendulum,
+    check_state,
+    fast_frequency,
+    positions,
+)
+from dpend.motion.simulate import Trajectory, simulate
 from dpend.plots import LOWER, UPPER
-from dpend.trajectory import Trajectory, simulate
+from dpend.records import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

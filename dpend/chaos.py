@@ -19,52 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from dpend.checks import integer, known_number, number
-from dpend.events import first_crossing
-from dpend.pendulum import (
-    Pendulum,
-    Scalar,
-    State,
-    check_motion,
-    check_pendulum,
-    energy_scale,
-    fast_frequency,
-    hamiltonian,
-)
-from dpend.steppers import Scheme, check_scheme
-from dpend.trajectory import fold
+from dpend.checks import Scalar, integer, known_number, number
+from dpend.mechanics.pendulum import Pendulum, State, check_motion, energy_scale, hamiltonian
+from dpend.mechanics.units import Norm, norm
+from dpend.methods.scheme import Scheme, check_scheme
+from dpend.motion.events import first_crossing
+from dpend.motion.integrate import fold
 
 # A tangent is scaled back by this once an angle of it exceeds the inverse: seldom, and exactly, being a power of two.
 _SCALE_BACK = 2.0**-300
-
-
-class Norm(NamedTuple):
-    """The size of a tangent; momenta are measured in units of 1/per_unit [kg m^2/s]. See the module's page."""
-
-    per_unit1: Scalar
-    per_unit2: Scalar
-
-    def square(self, tangent: State) -> Scalar:
-        """|d|^2, without dimension."""
-        rate1, rate2 = self.per_unit1 * tangent.p1, self.per_unit2 * tangent.p2
-        return tangent.theta1**2 + tangent.theta2**2 + rate1**2 + rate2**2
-
-    def vector(self, *components: float) -> State:
-        """The tangent with these components without dimension."""
-        theta1, theta2, rate1, rate2 = components
-        return State(
-            theta1 + 0.0 * self.per_unit1, theta2 + 0.0 * self.per_unit2, rate1 / self.per_unit1, rate2 / self.per_unit2
-        )
-
-
-def norm(pendulum: Pendulum | Any) -> Norm:
-    """The norm in which this page measures tangents of `pendulum`."""
-    check_pendulum(pendulum)
-    frequency = fast_frequency(pendulum)
-    rate = jnp.where(frequency > 0, frequency, 1.0)
-    unit1 = (pendulum.m1 + pendulum.m2) * pendulum.l1 * pendulum.l1 * rate
-    return Norm(1.0 / unit1, 1.0 / (pendulum.m2 * pendulum.l2 * pendulum.l2 * rate))
-
 
 # A unit tangent in none of the directions that symmetry or the flow singles out.
 GENERIC = (0.7, 0.5, 0.1, 0.5)

@@ -1,21 +1,14 @@
-"""The door: what a person hands to a public function is looked at here, before anything is computed.
-
-Each function takes the argument's name and its value, returns the value in the one form that the package computes with,
-and raises a ValueError that names the argument, what it must be, what it is, and what to give instead. Values traced by
-JAX have no number yet: of them the type and the shape are looked at, unless a function says otherwise.
-
-Public functions annotate `float | Any` or `Pendulum | Any`: the first is what they take, and a run-time type checker
-leaves the rest to this page, which knows what to say.
-"""
+"""What is refused at the door: bad arguments, with one error text for each kind."""
 
 import math
 import os
 import reprlib
+import tempfile
 from collections.abc import Sequence
 from decimal import Decimal
 from numbers import Integral, Number, Real
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -50,9 +43,6 @@ def shown(value: Any) -> str:
 def is_traced(value: Any) -> bool:
     """Whether a value is traced by a transformation of JAX."""
     return isinstance(value, jax.core.Tracer)
-
-
-# --- numbers ---------------------------------------------------------------------------------------------------------
 
 
 def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
@@ -232,9 +222,6 @@ def arrays(name: str, tree: Any) -> None:
             raise ValueError(f"{name} must be a tree of numbers and arrays, got {shown(leaf)} in it: give numbers")
 
 
-# --- choices ---------------------------------------------------------------------------------------------------------
-
-
 def flag(name: str, value: Any) -> bool:
     """True or False.
 
@@ -273,9 +260,6 @@ def at_most_one(**given: Any) -> None:
     if len(names) > 1:
         values = " and ".join(shown(given[name]) for name in names)
         raise ValueError(f"{' and '.join(names)} exclude each other, got {values}: give one of them")
-
-
-# --- things ----------------------------------------------------------------------------------------------------------
 
 
 def text(name: str, value: Any) -> str:
@@ -336,3 +320,35 @@ def file_path(name: str, value: Any) -> Path:
     if not isinstance(text, str) or not text or "\0" in text:
         raise ValueError(f'{name} must be a path, got {shown(value)}: give one like "F.json"')
     return Path(text)
+
+
+def unwritable(path: Path) -> str:
+    """Why no new file can be put beside `path`, in the system's words; empty if one can.
+
+    It is tried: permissions do not tell what the root user, a disk mounted for reading or the system's own directories
+    allow, nor how long a name may be.
+    """
+    try:
+        tempfile.NamedTemporaryFile(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent).close()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def check_place(name: str, path: Path, suffixes: Sequence[str]) -> None:
+    """Refuses, before anything is computed, a file that could not be written after.
+
+    Raises:
+        ValueError: another suffix; no directory to write in. `name` is the argument that is told.
+    """
+    if path.suffix not in suffixes:
+        raise ValueError(f"{name} must end in {' or '.join(suffixes)}, got {path}: give another name")
+    reason = "Is a directory" if os.path.isdir(path) else unwritable(path)
+    if reason:
+        raise ValueError(
+            f"{name} must be a file in a directory that can be written to, got {path} ({reason}): give another place"
+        )
+
+
+# A float64 scalar, or an array where a class holds many at once; transformations also pass tracers and placeholders.
+Scalar: TypeAlias = Any

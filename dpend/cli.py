@@ -5,7 +5,6 @@ error. 130: interrupted. 141: nobody reads standard output any more.
 """
 
 import contextlib
-import csv
 import errno
 import io
 import math
@@ -17,29 +16,46 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 import typer
 
 import dpend
-from dpend import survey
 from dpend._runtime import catch_interrupts, leave_quietly
-from dpend.atlas import MOST_STEPS as MOST_STEPS_OF_SEARCH
-from dpend.atlas import SECONDS_PER_STEP, expected_steps, known_period
-from dpend.catalogue import pendulum_record
-from dpend.checks import number
-from dpend.files import check_place, json_text, parse_decimal, replacing
-from dpend.orbits import BRANCHES, PeriodicOrbit, swinging_pendulum
-from dpend.pendulum import Pendulum, State
-from dpend.steppers import METHODS
-from dpend.stores import StoreWarning, check_store
-from dpend.sweeps import Cost
-from dpend.trajectory import MOST_STEPS, Status, Trajectory
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from dpend.catalogue import survey
+from dpend.catalogue.atlas import MOST_SEARCH_STEPS, SECONDS_PER_STEP, expected_steps, known_period
+from dpend.checks import check_place, number
+from dpend.maps.cost import Cost
+from dpend.maps.store import StoreWarning, check_store
+from dpend.mechanics.pendulum import Pendulum, State
+from dpend.methods.scheme import METHODS
+from dpend.motion.simulate import MOST_MOTION_STEPS
+from dpend.orbits.find import swinging_pendulum
+from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
+from dpend.records import parse_decimal, replacing
+from dpend.report import (
+    design_record,
+    draw,
+    draw_fit,
+    family_record,
+    fit_record,
+    motion_record,
+    on_terminal,
+    orbit_record,
+    print_atlas,
+    print_design,
+    print_family,
+    print_fit,
+    print_json,
+    print_motion,
+    print_orbits,
+    write_family_csv,
+    write_json,
+    writer,
+)
+from dpend.status import Status
 
 
 class _Command(typer.core.TyperCommand):
@@ -170,11 +186,11 @@ def orbit(
             )
             for name in (BRANCHES if both else (branch,))
         }
-    records = [_orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()]
+    records = [orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()]
     if as_json:
-        _print_json({"orbits": records} if both else records[0])
+        print_json({"orbits": records} if both else records[0])
     else:
-        _print_orbits(pendulum, found)
+        print_orbits(pendulum, found)
     return 0 if all(int(orbit.status) == Status.CONVERGED for orbit in found.values()) else 1
 
 
@@ -194,19 +210,19 @@ def family(
     """All orbits of a normal mode, from small swings to the upright pendulum, and where their stability changes."""
     if branch not in BRANCHES:
         raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
-    formats = {".csv": _write_family_csv, ".json": _write_json}
+    formats = {".csv": write_family_csv, ".json": write_json}
     if out is not None:
         check_place("out", out, tuple(formats))
     with _clock("following the family"):
         found = dpend.follow_family(Pendulum(l1, l2, m1, m2, g), branch)
-    record = _family_record(found, branch)
+    record = family_record(found, branch)
     if out is not None:
         with replacing(out) as draft:
             formats[out.suffix](record, draft)
     if as_json:
-        _print_json(record)
+        print_json(record)
     else:
-        _print_family(found, record, out)
+        print_family(found, record, out)
     return 0 if int(found.status) == Status.CONVERGED else 1
 
 
@@ -222,7 +238,7 @@ def atlas(
     ] = None,
     most_steps: Annotated[
         float, _numeric(help="Refuse a search that takes more time steps, or stop there: 1e9 take about an hour.")
-    ] = float(MOST_STEPS_OF_SEARCH),
+    ] = float(MOST_SEARCH_STEPS),
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -259,9 +275,9 @@ def atlas(
     if out is not None:
         found.save(out)
     if as_json:
-        _print_json(found.record())
+        print_json(found.record())
     else:
-        _print_atlas(found, theta1, out)
+        print_atlas(found, theta1, out)
     families = all(family["status"] == Status.CONVERGED.name.lower() for family in found.families)
     solved = families and np.all(found.table["status"] == Status.CONVERGED)
     return 0 if solved and not (found.coverage.suspicious_cells or found.coverage.exhausted) else 1
@@ -289,13 +305,13 @@ _BETWEEN_LINES = 15.0
 @contextlib.contextmanager
 def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
     """A progress bar on standard error; where that is no terminal a line now and then."""
-    with _bar(_on_terminal(), unit) as show:
+    with _bar(on_terminal(), unit) as show:
         started = last = time.perf_counter()
 
         def tell(done: float, planned: float) -> None:
             nonlocal last
             show(done, planned)
-            if not _on_terminal() and time.perf_counter() - last > _BETWEEN_LINES:
+            if not on_terminal() and time.perf_counter() - last > _BETWEEN_LINES:
                 last = time.perf_counter()
                 print(f"dpend: {done:.3g} of about {planned:.3g} {unit}, {last - started:.0f} s", file=sys.stderr)
 
@@ -338,11 +354,11 @@ def design(
     names, limits, angle = _names(free), _bounds(bounds or []), _radians("theta1", theta1)
     with _clock("designing"):
         found = dpend.design_pendulum(loss, start, names, branch=branches, theta1=angle, bounds=limits)
-    record = _design_record(found, start, branches, tuple(equations))
+    record = design_record(found, start, branches, tuple(equations))
     if as_json:
-        _print_json(record)
+        print_json(record)
     else:
-        _print_design(found, record, start, theta1)
+        print_design(found, record, start, theta1)
     return 0 if int(found.status) == Status.CONVERGED else 1
 
 
@@ -367,7 +383,7 @@ def simulate(
     ] = None,
     most_steps: Annotated[
         int, typer.Option(parser=_integer, metavar="INTEGER", help="How many steps are taken at most.")
-    ] = MOST_STEPS,
+    ] = MOST_MOTION_STEPS,
     out: Annotated[Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -379,8 +395,8 @@ def simulate(
     """The motion from a release, and how far its end may be believed."""
     pendulum = Pendulum(l1, l2, m1, m2, g)
     state = State(_radians("theta1", theta1), _radians("theta2", theta2), number("p1", p1), number("p2", p2))
-    write = _writer(out) if out is not None else None
-    if step is not None and step > 0 and MOST_STEPS < abs(duration / step) <= most_steps:
+    write = writer(out) if out is not None else None
+    if step is not None and step > 0 and MOST_MOTION_STEPS < abs(duration / step) <= most_steps:
         seconds = abs(duration / step) / _STEPS_A_SECOND
         _complain(f"{abs(duration / step):,.0f} steps take some {seconds / 60:.0f} minutes and "
                   f"{_BYTES_A_STEP * seconds * _STEPS_A_SECOND / 1e9:.0f} GB")  # fmt: skip
@@ -390,11 +406,11 @@ def simulate(
         )
     if write is not None:
         write(motion)
-    record = _motion_record(motion)
+    record = motion_record(motion)
     if as_json:
-        _print_json(record)
+        print_json(record)
     else:
-        _print_motion(record, motion, out)
+        print_motion(record, motion, out)
     return 0 if int(motion.status) == Status.CONVERGED else 1
 
 
@@ -439,7 +455,7 @@ def map_command(
     if figure is not None:
         check_place("figure", figure, (".png",))
     started, counts = time.perf_counter(), [0, 0, 0]
-    with _complaints_of_stores(), _bar(_on_terminal(), "cells") as show:
+    with _complaints_of_stores(), _bar(on_terminal(), "cells") as show:
 
         def tell(*now: int) -> None:
             counts[:] = now
@@ -470,9 +486,9 @@ def map_command(
         "out": str(out),
     }
     if figure is not None:
-        _draw(field, figure)
+        draw(field, figure)
     if as_json:
-        _print_json(record)
+        print_json(record)
     else:
         print(f"{record['cells']} cells in {seconds:.1f} s, {record['failed']} failed", end="; ")
         print(f"{record['steps_per_second']:.3g} steps/s of {field.attrs['method']}, {field.attrs['step']:.4g} s")
@@ -508,9 +524,9 @@ def animate(
         for one, two in zip(theta1, theta2, strict=True)
     ]
     motions = animation.motions_for(pendulum, releases, duration, speed=speed)
-    with _bar(_on_terminal(), "frames") as show:
+    with _bar(on_terminal(), "frames") as show:
         frames = animation.film(pendulum, motions, out, progress=show)
-    records = [_motion_record(motion) for motion in motions]
+    records = [motion_record(motion) for motion in motions]
     record = {
         "frames": frames,
         "frames_per_second": animation.FRAMES_PER_SECOND if out.suffix != ".png" else None,
@@ -518,7 +534,7 @@ def animate(
         "motions": records,
     }
     if as_json:
-        _print_json(record)
+        print_json(record)
     else:
         print(f"{frames} frames of {len(motions)} motion{'s' * (len(motions) > 1)} written to {out}")
         for one, two, motion in zip(theta1, theta2, records, strict=True):
@@ -562,16 +578,13 @@ def fit(
             noise=sigma,
         )
     if figure is not None:
-        _draw_fit(found, figure)
-    record = _fit_record(found)
+        draw_fit(found, figure)
+    record = fit_record(found)
     if as_json:
-        _print_json(record)
+        print_json(record)
     else:
-        _print_fit(record, figure)
+        print_fit(record, figure)
     return 0 if int(found.status) == Status.CONVERGED else 1
-
-
-# --- what is read ----------------------------------------------------------------------------------------------------
 
 
 def _radians(name: str, degrees: float) -> float:
@@ -699,10 +712,6 @@ def _cells(name: str, text: str, count: int) -> np.ndarray:
     return 0.5 * (centres - centres[::-1]) if start == -end else centres
 
 
-def _on_terminal() -> bool:
-    return sys.stderr is not None and sys.stderr.isatty()
-
-
 @contextlib.contextmanager
 def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
     """A progress bar on standard error with the time left, and the rate where steps are told too."""
@@ -730,7 +739,7 @@ def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
 @contextlib.contextmanager
 def _clock(doing: str) -> Iterator[None]:
     """What is being done and for how long, on a terminal: for what cannot tell how far it is."""
-    if not _on_terminal():
+    if not on_terminal():
         yield
         return
     from rich.console import Console
@@ -740,425 +749,6 @@ def _clock(doing: str) -> Iterator[None]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         progress.add_task("", total=None)
         yield
-
-
-# --- what is printed -------------------------------------------------------------------------------------------------
-
-
-def _orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
-    angle_error, period_error = orbit.error_estimate
-    status = Status(int(orbit.status))
-    return {
-        "theta1_deg": _degrees(orbit.theta1),
-        "theta2_deg": _degrees(orbit.theta2),
-        "period_s": float(orbit.period),
-        "energy_J": float(orbit.energy),
-        "residual": float(orbit.residual),
-        "iterations": int(orbit.iterations),
-        "status": status.name.lower(),
-        "message": dpend.message(status),
-        "symmetry": orbit.symmetry,
-        "kappa": float(orbit.kappa),
-        "log_abs_kappa": float(orbit.log_abs_kappa),
-        "stability": orbit.stability,
-        "dual": {"theta1_deg": _degrees(orbit.dual.theta1), "theta2_deg": _degrees(orbit.dual.theta2)},
-        "turns": [int(turn) for turn in orbit.turns],
-        "error_estimate": {"theta2_deg": _degrees(angle_error), "period_s": float(period_error)},
-        "pendulum": pendulum_record(orbit.pendulum),
-    }
-
-
-def _family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
-    orbits, status = family.orbits, Status(int(family.status))
-    columns = {
-        "arclength": family.arclength,
-        "theta1_deg": np.degrees(orbits.theta1),
-        "theta2_deg": np.degrees(orbits.theta2),
-        "period_s": orbits.period,
-        "energy_J": orbits.energy,
-        "kappa": orbits.kappa,
-        "log_abs_kappa": orbits.log_abs_kappa,
-        "theta2_error_deg": np.degrees(orbits.error_estimate[0]),
-        "period_error_s": orbits.error_estimate[1],
-    }
-    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
-    return {
-        "branch": branch,
-        "points": [dict(zip(columns, row, strict=True)) | {"symmetry": family.symmetry} for row in rows],
-        "bifurcations": [
-            {
-                "kind": point.kind,
-                "arclength": float(point.arclength),
-                "theta1_deg": _degrees(point.orbit.theta1),
-                "theta2_deg": _degrees(point.orbit.theta2),
-                "period_s": float(point.orbit.period),
-                "energy_J": float(point.orbit.energy),
-                "kappa": float(point.orbit.kappa),
-            }
-            for point in family.special_points
-        ],
-        "ends": list(family.ends),
-        "status": status.name.lower(),
-        "message": family.message,
-        "pendulum": pendulum_record(Pendulum(*(leaf[0] for leaf in jax.tree.leaves(orbits.pendulum)))),
-    }
-
-
-def _motion_record(motion: Trajectory) -> dict[str, Any]:
-    status = Status(int(motion.status))
-    assert motion.scheme is not None
-    return {
-        "final": {
-            "theta1_deg": _degrees(motion.state.theta1[-1]),
-            "theta2_deg": _degrees(motion.state.theta2[-1]),
-            "p1": float(motion.state.p1[-1]),
-            "p2": float(motion.state.p2[-1]),
-        },
-        "duration_s": float(motion.time[-1]),
-        "energy_drift": float(motion.energy_drift),
-        "error_estimate": float(motion.error_estimate),
-        "steps": int(motion.steps),
-        "method": motion.scheme.name,
-        "step_s": abs(float(motion.time[-1])) / int(motion.steps),
-        "status": status.name.lower(),
-        "tolerance": float(motion.tolerance),
-        "message": motion.message,
-    }
-
-
-def _design_record(
-    found: dpend.Design, start: Pendulum, branches: tuple[str, ...], equations: tuple[str, ...]
-) -> dict[str, Any]:
-    status = Status(int(found.status))
-    units = {"theta2_deg": ("theta2", math.degrees(1.0)), "period_s": ("period", 1.0), "kappa": ("kappa", 1.0)}
-    orbits = []
-    for i, (name, orbit) in enumerate(zip(branches, found.orbits, strict=True)):
-        slopes = {
-            key: {parameter: unit * float(np.atleast_1d(row)[i]) for parameter, row in found.sensitivities[of].items()}
-            for key, (of, unit) in units.items()
-        }
-        orbits.append(_orbit_record(orbit) | {"branch": name, "sensitivities": slopes})
-    return {
-        "pendulum": pendulum_record(found.pendulum),
-        "orbits": orbits,
-        "missed": dict(zip(equations, np.atleast_1d(found.loss).tolist(), strict=True)),
-        "distance": float(found.distance),
-        "at_bounds": list(found.at_bounds),
-        "iterations": int(found.iterations),
-        "looks": int(found.looks),
-        "status": status.name.lower(),
-        "message": found.message,
-        "start": pendulum_record(start),
-    }
-
-
-# How an estimate is shown: its name with its unit, and what it is multiplied by.
-_SHOWN = {
-    "l1": ("l1_m", 1.0), "l2": ("l2_m", 1.0), "m1": ("m1_kg", 1.0), "m2": ("m2_kg", 1.0), "g": ("g_m_s2", 1.0),
-    "l2/l1": ("l2/l1", 1.0), "m2/m1": ("m2/m1", 1.0), "g/l1": ("g/l1_s-2", 1.0),
-    "theta1": ("theta1_deg", math.degrees(1.0)), "theta2": ("theta2_deg", math.degrees(1.0)),
-    "omega1": ("omega1_deg_s", math.degrees(1.0)), "omega2": ("omega2_deg_s", math.degrees(1.0)),
-}  # fmt: skip
-
-
-def _fit_record(fit: dpend.Fit) -> dict[str, Any]:
-    status = Status(int(fit.status))
-    measured = np.sum(np.isfinite(fit.residual1)) + np.sum(np.isfinite(fit.residual2))
-
-    def shown(values: dict[str, Any]) -> dict[str, float]:
-        return {_SHOWN[name][0]: _SHOWN[name][1] * float(value) for name, value in values.items()}
-
-    return {
-        "estimates": shown(fit.estimates),
-        "standard_errors": shown(fit.standard_errors),
-        "free": list(fit.free),
-        "noise_deg": _degrees(fit.noise),
-        "expected_noise_deg": _degrees(fit.expected_noise),
-        "angles": int(measured),
-        "duration_s": float(fit.time[-1] - fit.time[0]),
-        "windows": int(fit.windows),
-        "iterations": int(fit.iterations),
-        "gap": float(fit.gap),
-        "error_estimate": float(fit.error_estimate),
-        "status": status.name.lower(),
-        "message": dpend.message(status),
-        "pendulum": pendulum_record(fit.pendulum),
-    }
-
-
-def _degrees(radians: Any) -> float:
-    return math.degrees(float(radians))
-
-
-def _print_json(record: dict[str, Any]) -> None:
-    print(json_text(record))
-
-
-# Wider than any table here: a number is never broken to fit a terminal.
-_TABLE_WIDTH = 200
-
-
-def _print_table(table: "Table") -> None:
-    from rich.console import Console
-
-    console = Console(width=_TABLE_WIDTH, highlight=False)
-    with console.capture() as text:
-        console.print(table)
-    print(text.get(), end="")
-
-
-def _print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
-    from rich.table import Table
-
-    table = Table(title=_described(pendulum), title_justify="left", title_style="")
-    for heading in ("", "theta1 (deg)", "theta2 (deg)", "period (s)", "stability", "kappa", "error (deg, s)"):
-        table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
-    failures = []
-    for name, orbit in found.items():
-        record = _orbit_record(orbit)
-        error = record["error_estimate"]
-        table.add_row(
-            name or record["symmetry"],
-            f"{record['theta1_deg']:.10g}",
-            f"{record['theta2_deg']:.9f}",
-            f"{record['period_s']:.11f}",
-            record["stability"],
-            f"{record['kappa']:.6g}",
-            f"{error['theta2_deg']:.0e}, {error['period_s']:.0e}",
-        )
-        if record["status"] != "converged":
-            failures.append(f"{name or 'guess'}: {record['status']}: {record['message']}")
-    _print_table(table)
-    for failure in failures:
-        print(failure)
-
-
-# Rows of the table that stand for a family.
-_SHOWN_POINTS = 12
-
-
-def _print_family(family: dpend.Family, record: dict[str, Any], out: Path | None) -> None:
-    from rich.table import Table
-
-    pendulum = Pendulum(*record["pendulum"].values())
-    table = Table(title=_described(pendulum), title_justify="left", title_style="")
-    headings = ("theta1 (deg)", "theta2 (deg)", "period (s)", "energy (J)", "stability", "log |kappa|", "")
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
-    points = record["points"]
-    chosen = np.unique(np.linspace(0, len(points) - 1, _SHOWN_POINTS).round().astype(int))
-    rows = [points[i] | {"kind": ""} for i in chosen]
-    for special in record["bifurcations"]:
-        logarithm = math.log(max(abs(special["kappa"]), sys.float_info.min))
-        rows.append(special | {"log_abs_kappa": logarithm})
-    for row in sorted(rows, key=lambda row: row["arclength"]):
-        marginal = row["kind"].startswith("stability")
-        table.add_row(
-            f"{row['theta1_deg']:.9f}",
-            f"{row['theta2_deg']:.9f}",
-            f"{row['period_s']:.10f}",
-            f"{row['energy_J']:.9f}",
-            "" if marginal else dpend.stability_class(row["kappa"]),
-            "0" if marginal else f"{row['log_abs_kappa']:.5g}",
-            row["kind"],
-        )
-    _print_table(table)
-    worst = max(point["theta2_error_deg"] for point in points)
-    print(f"{len(points)} orbits from {family.ends[0]} to {family.ends[1]}; error of theta2 at most {worst:.0e} deg")
-    if int(family.status) != Status.CONVERGED:
-        print(f"{record['status']}: {record['message']}")
-    if out is not None:
-        print(f"written to {out}")
-
-
-def _print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> None:
-    from rich.table import Table
-
-    table = Table(title=_described(atlas.pendulum), title_justify="left", title_style="")
-    headings: tuple[str, ...] = ("family", "periods (s)", "from", "to", "orbits")
-    rows = [_family_row(atlas, one) for one in atlas.families]
-    what = f"{len(atlas.families)} families with {len(atlas)} orbits in the table"
-    if theta1 is not None:
-        headings = ("theta2 (deg)", "period (s)", "symmetry", "stability", "kappa", "dual (deg)", "error (deg)")
-        rows = [_atlas_row(orbit) for orbit in atlas.orbits]
-        what = f"{len(atlas)} orbits with theta1 = {theta1:g} deg"
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in _WORDS else "right")
-    for row in rows:
-        table.add_row(*row)
-    _print_table(table)
-    seen = atlas.coverage
-    print(f"{what} and periods of at most {atlas.max_period:g} s", end="; ")
-    print(f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, {seen.time_points} times")
-    agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
-    if seen.exhausted:
-        print("STOPPED at the most time steps allowed: more is likely to be missing; raise --most-steps")
-    print(f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding number {agree}")
-    if out is not None:
-        print(f"written to {out}")
-
-
-_WORDS = ("symmetry", "stability", "family", "from", "to")
-
-
-def _atlas_row(orbit: PeriodicOrbit) -> list[str]:
-    dual = f"{_degrees(orbit.dual.theta1):.4f}, {_degrees(orbit.dual.theta2):.4f}"
-    return [
-        f"{_degrees(orbit.theta2):.9f}",
-        f"{float(orbit.period):.9f}",
-        orbit.symmetry,
-        orbit.stability,
-        f"{float(orbit.kappa):.6g}",
-        dual,
-        f"{_degrees(orbit.error_estimate[0]):.0e}",
-    ]
-
-
-def _family_row(atlas: dpend.Atlas, record: dict[str, Any]) -> list[str]:
-    count = int(np.sum(atlas.table["family"] == record["family"]))
-    periods = f"{record['shortest_period_s']:.6f} - {record['longest_period_s']:.6f}"
-    return [record["family"], periods, *record["ends"], str(count)]
-
-
-def _print_fit(record: dict[str, Any], figure: Path | None) -> None:
-    errors = record["standard_errors"]
-    for name, value in record["estimates"].items():
-        error = errors[name]
-        known = "held" if error == 0 else "not determined" if error == math.inf else f"+- {error:.2g}"
-        print(f"{name:14}{value:16.{_decimals(error)}f}  {known}")
-    print(f"{record['angles']} angles over {record['duration_s']:g} s; noise {record['noise_deg']:.3g} deg", end="")
-    print(f", of which {record['expected_noise_deg']:.3g} deg was expected")
-    if record["status"] != "converged":
-        print(f"{record['status']}: {record['message']}")
-    if figure is not None:
-        print(f"drawn in {figure}")
-
-
-def _decimals(error: float) -> int:
-    """As many as show two digits of the error, and six where there is none."""
-    return 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 12)
-
-
-def _described(pendulum: Pendulum) -> str:
-    values = (float(value) for value in jax.tree.leaves(pendulum))
-    return "l1 = {:g} m, l2 = {:g} m, m1 = {:g} kg, m2 = {:g} kg, g = {:g} m/s^2, released from rest".format(*values)
-
-
-def _print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, theta1: float) -> None:
-    from rich.table import Table
-
-    branches = (orbit["branch"] for orbit in record["orbits"])
-    _print_orbits(found.pendulum, dict(zip(branches, found.orbits, strict=True)))
-    table = Table(title="derivatives with respect to the logarithms", title_justify="left", title_style="")
-    table.add_column("")
-    for heading in ("start", "found"):
-        table.add_column(heading, justify="right")
-    for orbit in record["orbits"]:
-        for heading in ("period (s)", "kappa", "theta2 (deg)"):
-            table.add_column(f"{orbit['branch']}\n{heading}", justify="right")
-    units = {"l1": "m", "l2": "m", "m1": "kg", "m2": "kg", "g": "m/s^2", "theta1": "deg"}
-    angle = record["orbits"][0]["theta1_deg"]
-    values = [*jax.tree.leaves(start), theta1], [*jax.tree.leaves(found.pendulum), angle]
-    for (name, unit), before, after in zip(units.items(), *values, strict=True):
-        slopes = [orbit["sensitivities"][key][name] for orbit in record["orbits"] for key in _SLOPES]
-        row = [f"{float(before):g}", f"{float(after):.10g}", *(f"{slope:.6g}" for slope in slopes)]
-        table.add_row(f"{name} ({unit})", *row)
-    _print_table(table)
-    missed = ", ".join(f"{name} {value:.0e}" for name, value in record["missed"].items())
-    print(f"{record['iterations']} steps, {record['looks']} solves; misses {missed}; logarithms changed by", end=" ")
-    print(f"{record['distance']:.6g}" + (f"; at bounds: {', '.join(found.at_bounds)}" if found.at_bounds else ""))
-    if record["status"] != "converged":
-        print(f"{record['status']}: {record['message']}")
-
-
-_SLOPES = ("period_s", "kappa", "theta2_deg")
-
-
-def _print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) -> None:
-    final = record["final"]
-    angles = f"theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg"
-    print(f"after {record['duration_s']:g} s   {angles}")
-    print(f"                p1 = {final['p1']:.12g}, p2 = {final['p2']:.12g} kg m^2/s")
-    print(f"error estimate  {record['error_estimate']:.1e} rad, energy drift {record['energy_drift']:.1e} of its scale")
-    print(f"integrated by   {record['method']}, {record['steps']} steps of {record['step_s']:.4g} s")
-    if record["status"] != "converged":
-        print(f"{record['status']}: {record['message']}")
-    if out is not None:
-        print(f"written to      {out}: {motion.time.size} times")
-
-
-# --- what is written -------------------------------------------------------------------------------------------------
-
-
-def _writer(path: Path) -> Callable[[Trajectory], None]:
-    """How to write a motion to `path`; refuses before anything is computed what could not be written after."""
-    formats = {".csv": _write_csv, ".nc": _write_netcdf}
-    check_place("out", path, tuple(formats))
-
-    def write(motion: Trajectory) -> None:
-        with replacing(path) as draft:
-            formats[path.suffix](motion, draft)
-
-    return write
-
-
-def _write_csv(motion: Trajectory, path: Path) -> None:
-    state = motion.state
-    columns = (motion.time, np.degrees(state.theta1), np.degrees(state.theta2), state.p1, state.p2)
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["time_s", "theta1_deg", "theta2_deg", "p1_kg_m2_s", "p2_kg_m2_s"])
-        rows.writerows(zip(*(np.asarray(column).tolist() for column in columns), strict=True))
-
-
-def _write_family_csv(record: dict[str, Any], path: Path) -> None:
-    with path.open("w", newline="") as file:
-        rows = csv.DictWriter(file, record["points"][0])
-        rows.writeheader()
-        rows.writerows(record["points"])
-
-
-def _write_json(record: dict[str, Any], path: Path) -> None:
-    path.write_text(json_text(record) + "\n")
-
-
-def _write_netcdf(motion: Trajectory, path: Path) -> None:
-    motion.to_xarray().to_netcdf(path, engine="scipy")
-
-
-def _draw(field: Any, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from dpend import plots
-
-    names = [name for name in field.data_vars if name not in ("steps", "status", "bob")]
-    names = [name for name in names if name != "bob_error"]
-    fig, axes = plt.subplots(1, len(names), figsize=(5.6 * len(names), 4.6), layout="constrained", squeeze=False)
-    for name, ax in zip(names, axes[0], strict=True):
-        plots.map_of(field, name, ax)
-    with replacing(path) as draft:
-        fig.savefig(draft, dpi=200)
-    plt.close(fig)
-
-
-def _draw_fit(fit: dpend.Fit, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from dpend import plots
-
-    fig = plots.residuals(fit)
-    with replacing(path) as draft:
-        fig.savefig(draft, dpi=150)
-    plt.close(fig)
-
-
-# --- the program -----------------------------------------------------------------------------------------------------
 
 
 def _keep_compiled_code() -> None:

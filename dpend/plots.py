@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from dpend.checks import instance, integer, one_of, shown, single
-from dpend.families import Family
-from dpend.fit import Fit
-from dpend.orbits import PeriodicOrbit
-from dpend.pendulum import Pendulum, check_pendulum, energies, positions
-from dpend.trajectory import Trajectory, simulate
+from dpend.inverse.fit import Fit
+from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
+from dpend.motion.simulate import Trajectory, simulate
+from dpend.orbits.family import Family
+from dpend.orbits.orbit import PeriodicOrbit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -96,7 +96,7 @@ Jobs = dict[tuple[str, float], tuple[Callable[[], np.ndarray], np.ndarray]]
 
 def our_lanes(work: Workload, schemes: dict) -> Jobs:
     import dpend
-    from dpend.lanes import over_lanes
+    from dpend.maps.lanes import over_lanes
 
     state, every = dpend.released(work.theta1, work.theta2), np.arange(work.theta1.size)
 

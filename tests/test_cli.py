@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-import dpend.atlas
-import dpend.scan
-from dpend import cli
+import dpend.catalogue.atlas
+import dpend.catalogue.scan
+from dpend import cli, report
 
 
 @pytest.fixture(autouse=True)
@@ -201,7 +201,7 @@ def test_what_did_not_converge_says_why(capsys):
 
 
 def test_nan_and_infinity_are_null(capsys):
-    cli._print_json({"a": float("nan"), "b": [float("inf"), 1.0]})
+    report.print_json({"a": float("nan"), "b": [float("inf"), 1.0]})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0]}
 
 
@@ -241,7 +241,7 @@ def test_a_failed_write_leaves_the_old_file(capsys, tmp_path, monkeypatch):
         path.write_text("half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(cli, "_write_csv", fails)
+    monkeypatch.setattr(report, "_write_csv", fails)
     arguments = ("simulate", "--theta1", 40, "--theta2", 10, "--duration", 1, "--step", 0.01, "--out", target)
     status, _, err = run(capsys, *arguments)
     assert (status, err) == (2, "dpend: disk full\n")
@@ -415,10 +415,10 @@ def test_the_atlas_of_an_angle(capsys, tmp_path):
 
 def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
     def forgetful(*arguments):
-        result = dpend.scan.scanned(*arguments)
+        result = dpend.catalogue.scan.scanned(*arguments)
         return dataclasses.replace(result, zeros=result.zeros[1:])
 
-    monkeypatch.setattr(dpend.atlas, "scanned", forgetful)
+    monkeypatch.setattr(dpend.catalogue.atlas, "scanned", forgetful)
     status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
     assert (status, len(found["orbits"]), found["coverage"]["suspicious_cells"]) == (1, 4, 1)
 
