@@ -173,9 +173,9 @@ def fit_parameters(
     """The pendulum, and the state at the first time, whose motion is nearest to measured angles.
 
     Minimises the sum of squares of theta_model - theta_measured, modulo full turns, over both rods and all times; the
-    noise is taken to be independent, Gaussian and as large for both. Chaotic motions are no harder than calm ones:
-    `dpend.fit` tells how. Angles may be wrapped or not. Where one rod is not measured at all, its first angle and
-    velocity are sought on a grid.
+    noise is taken to be independent, Gaussian and as large for both. Chaotic motions are no harder than calm ones: the
+    docstring of this module tells how. Angles may be wrapped or not. Where one rod is not measured at all, its first
+    angle and velocity are sought on a grid.
 
     Arguments:
         times: increasing [s], shape (m,), in any spacing that shows the swings.

@@ -1,6 +1,6 @@
 """Families of periodic orbits: curves of releases, from small swings to the motions that take for ever.
 
-`follow_family` walks along one by pseudo-arclength, its orbits cut into segments (see `shooting`), and finds where its
+`follow_family` walks along one by pseudo-arclength, its orbits cut into segments (see `arc`), and finds where its
 stability changes, where it turns back and where others branch off; given such a place, it follows the branch.
 """
 

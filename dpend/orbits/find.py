@@ -7,7 +7,7 @@ given, theta2 and the period are two unknowns for two equations, without a phase
 - centred: theta(T/4) = 0 modulo pi, half the integration. The reversal (theta, p, t) -> (-theta, p, -t) about T/4 then
   gives x(T/2) = -x(0) up to full turns.
 
-A branch is followed from its normal mode by the walk that families take (`shooting`), turning points in theta1
+A branch is followed from its normal mode by the walk that families take (`walk`), turning points in theta1
 included; the orbit that it leads to is solved in one piece. Everything is traceable; derivatives with respect to the
 pendulum and the release angle come from the implicit function theorem at the root, never from Newton's iterations.
 """

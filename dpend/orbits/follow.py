@@ -1,6 +1,6 @@
 """Continuation: points of a family, the curve through them, its ends, and arcs for the families that branch off.
 
-Between the compiled walk (`shooting`) and what users see (`families`). All in natural units and in NumPy: what is done
+Between the compiled walk (`walk`) and what users see (`family`). All in natural units and in NumPy: what is done
 here between two calls of compiled code is done once in 32 points.
 """
 
