@@ -6,16 +6,67 @@ caller's to switch on.
 
 The options are undocumented, and XLA ends the process over a flag it does not know, so each name is looked up in the
 installed jaxlib first. What they are worth was measured: one order-8 trajectory with tangents runs six times as fast.
+The user's own `XLA_FLAGS` are tried in a process of their own first, which takes 0.2 s where there are any.
 """
 
 import contextlib
+import itertools
 import mmap
 import os
 import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
+from types import FrameType, TracebackType
 
 import jax
 import jaxlib
+
+
+def _is_program() -> bool:
+    """Whether this process is the command line: its script, or `python -m dpend.cli`."""
+    started = getattr(sys, "orig_argv", [])
+    as_module = any(pair == ("-m", "dpend.cli") for pair in itertools.pairwise(started))
+    return as_module or os.path.basename(sys.argv[0] if sys.argv else "") in ("dpend", "dpend.exe")
+
+
+def leave_quietly() -> None:
+    """Has Ctrl-C end the process at once with status 130, and what is not caught be one line.
+
+    The program uses it while it imports and while it ends: there is nothing to save then, and no one to catch it.
+    """
+    _on_interrupt(signal.default_int_handler, _leave)
+    sys.excepthook = _tell_in_one_line
+
+
+def catch_interrupts() -> None:
+    """Has Ctrl-C raise KeyboardInterrupt again."""
+    _on_interrupt(_leave, signal.default_int_handler)
+    sys.excepthook = sys.__excepthook__
+
+
+def _on_interrupt(before: Callable[..., object], after: Callable[..., object]) -> None:
+    # A handler of somebody else stays: a shell, say, has what it starts in the background ignore Ctrl-C.
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is before:
+        signal.signal(signal.SIGINT, after)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os._exit(130)
+
+
+def _tell_in_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if issubclass(kind, (RuntimeError, ValueError, OSError)):
+        sys.stderr.write("dpend: " + " ".join(str(error).split()) + "\n")
+    else:
+        sys.__excepthook__(kind, error, trace)
+
+
+if _is_program():
+    leave_quietly()
 
 PLAIN = "DPEND_PLAIN_JAX"
 
@@ -60,6 +111,41 @@ def _extended_flags(flags: str) -> str:
     return " ".join([flags, *added]).strip()
 
 
+# What has XLA parse its flags, once in a process; no backend starts for that.
+_PARSE = "from jaxlib.xla_client import CompileOptions; CompileOptions().executable_build_options.debug_options"
+# It takes 0.2 s; on a machine that is this busy the flags go untried.
+_PATIENCE = 60.0
+
+
+def _check_flags() -> None:
+    """Refuses the user's `XLA_FLAGS` where the installed XLA would end the process over them.
+
+    XLA itself is asked, in a process of its own: it alone knows its flags, and which values they take.
+
+    Raises:
+        RuntimeError: a flag that it does not know, a value that it cannot read, or a file of flags that is not there.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if not flags.strip() or not sys.executable:
+        return
+    paths = os.pathsep.join(path for path in sys.path if path)
+    command, environment = [sys.executable, "-c", _PARSE], {**os.environ, "PYTHONPATH": paths, "PYTHONWARNINGS": ""}
+    try:
+        asked = subprocess.run(
+            command, env=environment, capture_output=True, text=True, errors="replace", timeout=_PATIENCE
+        )
+    except (OSError, subprocess.SubprocessError):
+        return
+    said = re.search(r"^F.*parse_flags_from_env[^]]*\] *(.*)", asked.stderr, re.MULTILINE)
+    if asked.returncode != 0 and said:
+        unknown = re.search(r"Unknown flags? in XLA_FLAGS: (.*)", said[1])
+        wrong = unknown[1].strip() if unknown else flags.strip()
+        raise RuntimeError(
+            f"XLA_FLAGS must hold flags and values that the installed XLA knows, got {wrong!r:.200}: "
+            "take them out of the environment"
+        )
+
+
 def _add_compile_options() -> None:
     """Has XLA parse its options with ours among them, then restores `XLA_FLAGS`, which child processes inherit."""
     before = os.environ.get("XLA_FLAGS")
@@ -82,7 +168,11 @@ def _cores() -> int:
 
 
 def configure() -> None:
-    """Sets JAX up for this package, unless it runs already or `DPEND_PLAIN_JAX=1` asks to leave it alone."""
+    """Sets JAX up for this package, unless it runs already or `DPEND_PLAIN_JAX=1` asks to leave it alone.
+
+    Raises:
+        RuntimeError: `XLA_FLAGS` that XLA would end the process over.
+    """
     if os.environ.get(PLAIN, "") not in ("", "0"):
         return
     devices = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
@@ -94,6 +184,7 @@ def configure() -> None:
         return
     if "JAX_ENABLE_X64" not in os.environ:  # the user's own word stands; `require_float64` then says what is missing
         jax.config.update("jax_enable_x64", True)
+    _check_flags()
     with contextlib.suppress(OSError):
         _add_compile_options()
 

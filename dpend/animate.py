@@ -7,14 +7,23 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dpend.files import check_place, replacing
-from dpend.pendulum import Pendulum, State, fast_frequency, number, positions
+from dpend.checks import check_place, file_path, function, instance, known_number, shown
+from dpend.mechanics.pendulum import (
+    Pendulum,
+    State,
+    check_motion,
+    check_pendulum,
+    check_state,
+    fast_frequency,
+    positions,
+)
+from dpend.motion.simulate import Trajectory, simulate
 from dpend.plots import LOWER, UPPER
-from dpend.trajectory import Trajectory, simulate
+from dpend.records import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,12 +42,12 @@ _TRAIL = 0.6
 _PIXELS = 480  # a multiple of 16, as video codecs want it
 # Beyond this a GIF is hundreds of megabytes, and no one waits for it.
 _MOST_FRAMES = 10_000
-# A few seconds of computing for each release.
-_MOST_STEPS = 1e7
+# Half a minute of computing for each release; only a few of its states are saved.
+_MOST_STEPS = 10_000_000
 
 
 def motions_for(
-    pendulum: Pendulum, releases: Sequence[State], duration: float, *, speed: float = 1.0
+    pendulum: Pendulum | Any, releases: Sequence[State] | Any, duration: float | Any, *, speed: float | Any = 1.0
 ) -> list[Trajectory]:
     """The motions from `releases`, saved four times a frame.
 
@@ -49,10 +58,16 @@ def motions_for(
         Trajectories with equal times. Their status says whether their end may be believed.
     Raises:
         ValueError: duration or speed not positive; a speed at which the motion does not last for a frame; more than
-            10 000 frames, or 1e7 steps.
+            10 000 frames, or 1e7 steps; rates that overflow.
     """
-    interval = float(number("speed", speed, positive=True)) / FRAMES_PER_SECOND
-    duration = float(number("duration", duration, positive=True, unit="s"))
+    if not isinstance(releases, Sequence) or isinstance(releases, (str, bytes)):
+        raise ValueError(f"releases must be a sequence of states, got {shown(releases)}: give one like [state]")
+    for release in releases:
+        check_state(release, "releases")
+        check_motion(pendulum, release)
+    check_pendulum(pendulum)
+    interval = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
+    duration = known_number("duration", duration, positive=True, unit="s")
     if not interval <= duration:
         raise ValueError(f"speed must show the motion of {duration:g} s for a frame at least, got {speed:g}: lower it")
     count = duration / interval if interval > 0 else math.inf
@@ -62,22 +77,24 @@ def motions_for(
         )
     frames = math.ceil(count - 1e-9)
     substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
-    if not frames * substeps <= _MOST_STEPS:
+    steps = frames * _SAVED * (substeps + 1)
+    if not steps <= _MOST_STEPS:
         raise ValueError(
-            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {frames * substeps:.3g}: "
-            "give a shorter one, or another pendulum"
+            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {duration:g} s, which takes "
+            f"{steps:.3g}: give a shorter one, or another pendulum"
         )
     every = max(1, math.ceil(substeps))
     step = interval / (_SAVED * every)
-    return [simulate(pendulum, release, frames * interval, step=step, save_every=every) for release in releases]
+    end, most = frames * interval, 2 * _MOST_STEPS
+    return [simulate(pendulum, one, end, step=step, save_every=every, most_steps=most) for one in releases]
 
 
 def film(
-    pendulum: Pendulum,
-    motions: Sequence[Trajectory],
-    out: Path,
+    pendulum: Pendulum | Any,
+    motions: Sequence[Trajectory] | Any,
+    out: Path | Any,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | Any | None = None,
 ) -> int:
     """Draws motions with common, equally spaced times into `out`; returns the number of frames.
 
@@ -89,15 +106,24 @@ def film(
         ValueError: another suffix, no such directory, no motions, or motions with different times.
         RuntimeError: .mp4 without imageio-ffmpeg.
     """
+    out = file_path("out", out)
     check_out(out)
+    check_pendulum(pendulum)
+    if not isinstance(motions, Sequence):
+        raise ValueError(f"motions must be a sequence of trajectories, got {shown(motions)}: see motions_for")
+    for motion in motions:
+        instance("motions", motion, Trajectory, "a list of them, see motions_for")
+    if progress is not None:
+        function("progress", progress, "(frames done, frames in all)", "print")
     if not motions or not all(np.array_equal(motion.time, motions[0].time) for motion in motions):
         raise ValueError(f"motions must be at least one, saved at the same times, got {len(motions)}: see motions_for")
     with replacing(out) as draft:
         return _WRITERS[out.suffix](pendulum, motions, draft, progress or (lambda done, total: None))
 
 
-def check_out(out: Path) -> None:
+def check_out(out: Path | Any) -> None:
     """Refuses, before anything is computed, what `film` could not write; raises as it does."""
+    out = file_path("out", out)
     check_place("out", out, tuple(_WRITERS))
     if out.suffix == ".mp4":
         _encoder()

@@ -10,49 +10,24 @@ Exponents in the limit of long times do not depend on the norm; finite-time ones
 """
 
 import math
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from dpend.events import first_crossing
-from dpend.pendulum import Pendulum, Scalar, State, energy_scale, fast_frequency, hamiltonian, number
-from dpend.steppers import Scheme
-from dpend.trajectory import fold
+from dpend.checks import Scalar, integer, known_number, number
+from dpend.mechanics.pendulum import Pendulum, State, check_motion, energy_scale, hamiltonian
+from dpend.mechanics.units import Norm, norm
+from dpend.methods.scheme import Scheme, check_scheme
+from dpend.motion.events import first_crossing
+from dpend.motion.integrate import fold
 
 # A tangent is scaled back by this once an angle of it exceeds the inverse: seldom, and exactly, being a power of two.
 _SCALE_BACK = 2.0**-300
-
-
-class Norm(NamedTuple):
-    """The size of a tangent; momenta are measured in units of 1/per_unit [kg m^2/s]. See the module's page."""
-
-    per_unit1: Scalar
-    per_unit2: Scalar
-
-    def square(self, tangent: State) -> Scalar:
-        """|d|^2, without dimension."""
-        rate1, rate2 = self.per_unit1 * tangent.p1, self.per_unit2 * tangent.p2
-        return tangent.theta1**2 + tangent.theta2**2 + rate1**2 + rate2**2
-
-    def vector(self, *components: float) -> State:
-        """The tangent with these components without dimension."""
-        theta1, theta2, rate1, rate2 = components
-        return State(
-            theta1 + 0.0 * self.per_unit1, theta2 + 0.0 * self.per_unit2, rate1 / self.per_unit1, rate2 / self.per_unit2
-        )
-
-
-def norm(pendulum: Pendulum) -> Norm:
-    """The norm in which this page measures tangents of `pendulum`."""
-    frequency = fast_frequency(pendulum)
-    rate = jnp.where(frequency > 0, frequency, 1.0)
-    unit1 = (pendulum.m1 + pendulum.m2) * pendulum.l1 * pendulum.l1 * rate
-    return Norm(1.0 / unit1, 1.0 / (pendulum.m2 * pendulum.l2 * pendulum.l2 * rate))
-
 
 # A unit tangent in none of the directions that symmetry or the flow singles out.
 GENERIC = (0.7, 0.5, 0.1, 0.5)
@@ -81,6 +56,23 @@ def _log(norm: Norm, tangent: State, count: _Count) -> Scalar:
     return 0.5 * jnp.log(norm.square(tangent)) - math.log(_SCALE_BACK) * count.turns
 
 
+def _at_the_door(compiled: Callable[..., dict[str, Scalar]]) -> Callable[..., dict[str, Scalar]]:
+    """A compiled quantity behind the checks of its arguments, which `jit` would refuse in words of its own."""
+
+    @wraps(compiled)
+    def quantity(pendulum: Any, state: Any, scheme: Any, **settings: Any) -> dict[str, Scalar]:
+        check_motion(pendulum, state)
+        check_scheme(scheme)
+        if "duration" in settings:
+            settings["duration"] = known_number("duration", settings["duration"], unit="s")
+        if "windows" in settings:
+            settings["windows"] = integer("windows", settings["windows"], least=4)
+        return compiled(pendulum, state, scheme, **settings)
+
+    return quantity
+
+
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def lyapunov(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """The finite-time Lyapunov exponent ln(|d(T)|/|d(0)|)/T of a generic tangent [1/s].
@@ -103,6 +95,7 @@ def lyapunov(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     return {"lyapunov": _log(size, tangent, count) / duration, "steps": count.steps.astype(int)}
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration", "windows"))
 def maximal_lyapunov(
     pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float, windows: int = 20
@@ -124,8 +117,8 @@ def maximal_lyapunov(
         ValueError: windows odd or too few; as `flow`.
     """
     duration = float(number("duration", duration, positive=True, unit="s"))
-    if windows < 4 or windows % 2:
-        raise ValueError(f"windows must be an even number of at least 4, got {windows}")
+    if windows % 2:
+        raise ValueError(f"windows must be an even number of at least 4, got {windows}: give {windows + 1}")
     size = norm(pendulum)
 
     def window(carry: tuple[State, State, Scalar], _: None) -> tuple[tuple[State, State, Scalar], Scalar]:
@@ -150,6 +143,7 @@ def _followed(both, time, dt, state, tangent):  # type: ignore[no-untyped-def]
     return (state, count), tangent
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def spectrum(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """All four Lyapunov exponents over a finite time, largest first [1/s].
@@ -193,6 +187,7 @@ def spectrum(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: floa
     return {f"exponent{i + 1}": logs[i] / duration for i in range(4)} | {"steps": steps.astype(int)}
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def megno(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """The time-averaged MEGNO, mean exponential growth of nearby orbits.
@@ -239,6 +234,7 @@ def _upright(pendulum: Pendulum, state: State) -> tuple[Scalar, Scalar]:
     return wave(state.theta1), wave(state.theta2)
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def flip(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """When a bob first goes over the top: the first t > 0 at which cos(theta1/2) or cos(theta2/2) changes sign.
@@ -262,6 +258,7 @@ def flip(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -
     return {"flip_time": time, "bob": crossing.which + 1, "steps": crossing.steps.astype(int)}
 
 
+@_at_the_door
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def drift(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """The largest |H - H(0)| after any step, in units of `energy_scale`: how well the method keeps the energy.

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from dpend.families import Family
-from dpend.fit import Fit
-from dpend.orbits import PeriodicOrbit
-from dpend.pendulum import Pendulum, State, energies, positions
-from dpend.trajectory import Trajectory, simulate
+from dpend.checks import instance, integer, one_of, shown, single
+from dpend.inverse.fit import Fit
+from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
+from dpend.motion.simulate import Trajectory, simulate
+from dpend.orbits.family import Family
+from dpend.orbits.orbit import PeriodicOrbit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,12 +25,24 @@ UPPER, LOWER, NEUTRAL = "#0072B2", "#D55E00", "#555555"
 _STROBES = 13
 
 
-def _axes(ax: "Axes | None") -> "Axes":
-    if ax is not None:
-        return ax
+def _axes(ax: Any) -> "Axes":
+    """The axes that were given, or new ones.
+
+    Raises:
+        ValueError: something else was given.
+    """
     import matplotlib.pyplot as plt
+    from matplotlib.axes import Axes
+
+    if ax is not None:
+        instance("ax", ax, Axes, "those of matplotlib.pyplot.subplots()")
+        return ax
 
     return plt.subplots(figsize=(4.5, 4.0), layout="constrained")[1]
+
+
+def _check_motion(motion: Any) -> None:
+    instance("motion", motion, Trajectory, "what dpend.simulate returns")
 
 
 def _legend_above(ax: "Axes", columns: int) -> None:
@@ -39,8 +52,9 @@ def _legend_above(ax: "Axes", columns: int) -> None:
     ax.legend(frameon=False, fontsize="small", loc="upper center", ncols=columns)
 
 
-def path(motion: Trajectory, ax: "Axes | None" = None) -> "Axes":
+def path(motion: Trajectory | Any, ax: "Axes | Any | None" = None) -> "Axes":
     """The path in the plane of the two angles [deg], with a dot at the release."""
+    _check_motion(motion)
     ax = _axes(ax)
     theta1, theta2 = np.degrees(motion.state.theta1), np.degrees(motion.state.theta2)
     ax.plot(theta1, theta2, color=NEUTRAL, linewidth=1.2)
@@ -50,8 +64,9 @@ def path(motion: Trajectory, ax: "Axes | None" = None) -> "Axes":
     return ax
 
 
-def angles(motion: Trajectory, ax: "Axes | None" = None) -> "Axes":
+def angles(motion: Trajectory | Any, ax: "Axes | Any | None" = None) -> "Axes":
     """Both angles [deg] against time [s]."""
+    _check_motion(motion)
     ax = _axes(ax)
     ax.plot(motion.time, np.degrees(motion.state.theta1), color=UPPER, label="theta1")
     ax.plot(motion.time, np.degrees(motion.state.theta2), color=LOWER, label="theta2", linestyle="--")
@@ -61,8 +76,10 @@ def angles(motion: Trajectory, ax: "Axes | None" = None) -> "Axes":
     return ax
 
 
-def energy(pendulum: Pendulum, motion: Trajectory, ax: "Axes | None" = None) -> "Axes":
+def energy(pendulum: Pendulum | Any, motion: Trajectory | Any, ax: "Axes | Any | None" = None) -> "Axes":
     """Kinetic and potential energy of both bobs [J] against time [s], each bob's zero where it hangs at rest."""
+    check_pendulum(pendulum)
+    _check_motion(motion)
     ax = _axes(ax)
     bobs = energies(pendulum, motion.state)
     for values, colour, style, label in (
@@ -78,10 +95,14 @@ def energy(pendulum: Pendulum, motion: Trajectory, ax: "Axes | None" = None) -> 
     return ax
 
 
-def strobe(pendulum: Pendulum, motion: Trajectory, ax: "Axes | None" = None, every: int = 1) -> "Axes":
+def strobe(
+    pendulum: Pendulum | Any, motion: Trajectory | Any, ax: "Axes | Any | None" = None, every: int | Any = 1
+) -> "Axes":
     """The rods at every `every`-th saved time [positions in m], later ones darker."""
-    ax = _axes(ax)
-    seen = State(*(np.asarray(leaf)[::every] for leaf in jax.tree.leaves(motion.state)))
+    check_pendulum(pendulum)
+    _check_motion(motion)
+    every, ax = integer("every", every), _axes(ax)
+    seen = jax.tree.map(lambda leaf: np.asarray(leaf)[::every], motion.state)
     x1, y1, x2, y2 = (np.asarray(value) for value in positions(pendulum, seen))
     for i in range(x1.size):
         fade = 0.25 + 0.75 * (i + 1) / x1.size
@@ -96,18 +117,28 @@ def strobe(pendulum: Pendulum, motion: Trajectory, ax: "Axes | None" = None, eve
     return ax
 
 
-def orbit_sheet(orbits: dict[str, PeriodicOrbit]) -> "Figure":
-    """One row for each named orbit: the rods over half a period, its path, and its angles over one period."""
+def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
+    """One row for each named orbit: the rods over half a period, its path, and its angles over one period.
+
+    Raises:
+        ValueError: no dictionary of single orbits that are known.
+    """
     import matplotlib.pyplot as plt
 
+    if not isinstance(orbits, dict) or not orbits:
+        raise ValueError(f"orbits must be a dictionary of orbits, got {shown(orbits)}: give one like {{'A': orbit}}")
+    for name, orbit in orbits.items():
+        instance(f"orbits[{name!r}]", orbit, PeriodicOrbit, "what dpend.find_orbit returns")
+        single(f"orbits[{name!r}]", orbit.period)
+
     fig, grid = plt.subplots(len(orbits), 3, figsize=(10.5, 3.3 * len(orbits)), layout="constrained", squeeze=False)
+    steps = 20 * (_STROBES - 1)  # over half a period, so that the strobes fall on both rests
     for (name, orbit), row in zip(orbits.items(), grid, strict=True):
         period = float(orbit.period)
-        steps = 20 * (_STROBES - 1)  # over half a period, so that the strobes fall on both rests
         whole = simulate(orbit.pendulum, orbit.state, period, step=period / (2 * steps), error=False)
         half = Trajectory(
             whole.time[: steps + 1],
-            State(*(leaf[: steps + 1] for leaf in jax.tree.leaves(whole.state))),
+            jax.tree.map(lambda leaf: leaf[: steps + 1], whole.state),
             whole.energy_drift, whole.error_estimate, whole.steps, whole.status, whole.scheme,
         )  # fmt: skip
         strobe(orbit.pendulum, half, row[0], every=20)
@@ -124,7 +155,12 @@ _MARKS = {"resonance": "|", "fold": "^", "stability": "o"}
 
 
 def family(
-    curve: Family, ax: "Axes | None" = None, *, plane: str = "angles", colour: str = UPPER, label: str = ""
+    curve: Family | Any,
+    ax: "Axes | Any | None" = None,
+    *,
+    plane: str | Any = "angles",
+    colour: str | Any = UPPER,
+    label: str | Any = "",
 ) -> "Axes":
     """A family of orbits: solid where they are stable (|kappa| <= 1), dashed where not, its special points marked.
 
@@ -134,10 +170,16 @@ def family(
     Arguments:
         plane: `angles` for the releases (theta1, theta2) [deg], `period` for the period [s] against the energy [J].
     Raises:
-        ValueError: another plane.
+        ValueError: another plane; no colour of matplotlib's.
     """
-    if plane not in ("angles", "period"):
-        raise ValueError(f"plane must be angles or period, got {plane!r}")
+    from matplotlib.colors import is_color_like
+
+    instance("curve", curve, Family, "what dpend.follow_family returns")
+    plane = one_of("plane", plane, ("angles", "period"))
+    if not is_color_like(colour):
+        raise ValueError(f'colour must be one that matplotlib knows, got {shown(colour)}: give one like "black"')
+    if not isinstance(label, str):
+        raise ValueError(f'label must be text, got {shown(label)}: give one like "in phase"')
     ax = _axes(ax)
 
     side = np.sign(np.mean(curve.orbits.theta1))
@@ -177,7 +219,7 @@ _LABELS = {
 _MOST_CELLS = 1500
 
 
-def map_of(dataset: Any, name: str | None = None, ax: "Axes | None" = None) -> "Axes":
+def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" = None) -> "Axes":
     """One value of a two-dimensional sweep in colours, its first axis to the right, its second upwards.
 
     Angles are in degrees. Values over decades (errors, drifts, times) have a logarithmic scale. Cells without a finite
@@ -191,11 +233,13 @@ def map_of(dataset: Any, name: str | None = None, ax: "Axes | None" = None) -> "
         ValueError: the dataset has not two dimensions, or no such value.
     """
     import matplotlib.colors
+    import xarray
     from matplotlib.ticker import MultipleLocator
 
-    name = name or next((key for key in dataset.data_vars if key in _LABELS), next(iter(dataset.data_vars)))
-    if name not in dataset.data_vars:
-        raise ValueError(f"name must be one of {', '.join(dataset.data_vars)}, got {name!r}")
+    instance("dataset", dataset, xarray.Dataset, "what dpend.sweep returns")
+    names = [str(key) for key in dataset.data_vars]
+    first = next((key for key in names if key in _LABELS), names[0] if names else None)
+    name = one_of("name", first if name is None else name, names)
     field = dataset[name]
     if field.ndim != 2:
         raise ValueError(f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve")
@@ -252,7 +296,7 @@ def _no_flip(dataset: Any, ax: "Axes", across: str) -> None:
     ax.contour(*arguments, levels=[saddle], colors="black", linewidths=1.0)
 
 
-def residuals(fit: Fit) -> "Figure":
+def residuals(fit: Fit | Any) -> "Figure":
     """A fit over its data: the angles [deg], and what is left of them beside a band of twice the noise to either side.
 
     Measured angles are dots, shown in the turn in which the fitted motion is, which is drawn as a line; blue for the
@@ -260,6 +304,7 @@ def residuals(fit: Fit) -> "Figure":
     """
     import matplotlib.pyplot as plt
 
+    instance("fit", fit, Fit, "what dpend.fit_parameters returns")
     fig, grid = plt.subplots(
         3, 1, figsize=(9.0, 6.6), sharex=True, layout="constrained", gridspec_kw={"height_ratios": [2.2, 1, 1]}
     )

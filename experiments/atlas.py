@@ -91,9 +91,9 @@ def curve_of(atlas: dpend.Atlas, record: dict) -> tuple[list[np.ndarray], np.nda
         dual = curve("dual_theta1", "dual_theta2")
         curves += [dual, -dual]
     period = np.interp(0.5 * (arc[1:] + arc[:-1]), table["arclength"], table["period"])
-    stable = np.full(
-        arc.size - 1, abs(table["kappa"][0]) < 1 if not changes else changes[0]["kind"] == "stability_lost"
-    )
+    # Without a change the middle orbit tells: at an end that is a branch point kappa is 1 but for rounding.
+    always = np.median(np.abs(table["kappa"])) < 1
+    stable = np.full(arc.size - 1, changes[0]["kind"] == "stability_lost" if changes else always)
     for place, point in zip(places, changes, strict=True):
         stable[arc[:-1] >= place] = point["kind"] == "stability_gained"
     return curves, period, stable

@@ -50,7 +50,7 @@ def grid(side: int) -> dict[str, np.ndarray]:
 
 
 def seconds(job, least: float = 0.5) -> tuple[float, float]:
-    """Median of warm calls, and the first call less that."""
+    """Median of warm calls, and the first call, which compiles and runs once."""
     start = time.perf_counter()
     job()
     first, times = time.perf_counter() - start, []
@@ -58,7 +58,7 @@ def seconds(job, least: float = 0.5) -> tuple[float, float]:
         start = time.perf_counter()
         job()
         times.append(time.perf_counter() - start)
-    return float(np.median(times)), first - float(np.median(times))
+    return float(np.median(times)), first
 
 
 def swept(side: int, duration: float = 0.5, **options):

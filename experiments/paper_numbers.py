@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from digits import round_up, show
 
 import dpend
 
@@ -258,7 +259,11 @@ CONFIRMED, ONLY_PRINTED, DIFFERS = "confirmed", "confirmed as printed only", "di
 
 @dataclass(frozen=True)
 class Claim:
-    """A printed number beside ours. `error` bounds the true one; `verdict` begins with one of the three words."""
+    """A printed number beside ours.
+
+    `error` bounds the true one and `rounding` is how far processors may differ in both; zero for counts. `verdict`
+    begins with one of the three words.
+    """
 
     section: str
     quantity: str
@@ -268,6 +273,16 @@ class Claim:
     error: float
     unit: str
     verdict: str
+    rounding: float = 0.0
+
+
+# How far two processors may differ in a number, by its unit: a thousand times what they were seen to (with and without
+# AVX-512, and the options of XLA that dpend sets). No error bound is less.
+ROUNDING = {"deg": 1e-10, "rad": 1e-12, "s": 1e-12, "J": 1e-12, "rad/s": 1e-12, "": 1e-10}
+# The same where a motion magnifies rounding: over eight periods of the unstable D (its miss was seen to differ by 1e-9
+# degrees), over 5 s of the chaotic one (somersaults 2e-11 s, the logarithms of distances of 1e-8 rad 2e-6/s), and over
+# 10 000 s of it, where an exponent is one of many.
+_UNSTABLE, _CHAOTIC, _PARTING, _LONG = 1e-7, 1e-8, 1e-4, 0.1
 
 
 def rounds_to(value: float, printed: str) -> bool:
@@ -296,15 +311,21 @@ class Table:
     def __init__(self) -> None:
         self.claims: list[Claim] = []
 
-    def number(self, section, quantity, printed, as_printed, true, error, unit="", reason=""):  # type: ignore[no-untyped-def]
+    def number(self, section, quantity, printed, as_printed, true, error, unit="", reason="", rounding=None):  # type: ignore[no-untyped-def]
         """A printed number, judged by its own digits."""
         verdict = judged(printed, as_printed, true, reason)
-        self.claims.append(Claim(section, quantity, printed, as_printed, true, error, unit, verdict))
+        self._add(section, quantity, printed, as_printed, true, error, unit, verdict, rounding)
 
-    def statement(self, section, quantity, printed, as_printed, true, error, unit, holds, reason=""):  # type: ignore[no-untyped-def]
+    def statement(self, section, quantity, printed, as_printed, true, error, unit, holds, reason="", rounding=None):  # type: ignore[no-untyped-def]
         """Something said in words, judged by a measure of it: `holds`, or not and why."""
         verdict = CONFIRMED if holds else f"{DIFFERS}: {reason}"
-        self.claims.append(Claim(section, quantity, printed, as_printed, true, error, unit, verdict))
+        self._add(section, quantity, printed, as_printed, true, error, unit, verdict, rounding)
+
+    def _add(self, section, quantity, printed, as_printed, true, error, unit, verdict, rounding):  # type: ignore[no-untyped-def]
+        if rounding is None:
+            rounding = 0.0 if isinstance(true, int) else ROUNDING.get(unit, ROUNDING[""])
+        error = round_up(max(error, rounding))
+        self.claims.append(Claim(section, quantity, printed, as_printed, true, error, unit, verdict, rounding))
 
     def read(self, section, quantity, printed, name, value, unit="", reason=""):  # type: ignore[no-untyped-def]
         """A number that `value` reads off the motion of a case; its error, by half the sampling step."""
@@ -518,7 +539,7 @@ def stability(table: Table) -> None:
         )
         table.statement(
             "D", f"released at (63.95, -63.95) deg: miss after {count} periods", "comes back", as_printed, true,
-            bound(true, finer), "deg", true < 0.1, "0.03 true degrees off an unstable motion",
+            bound(true, finer), "deg", true < 0.1, "0.03 true degrees off an unstable motion", _UNSTABLE,
         )  # fmt: skip
 
 
@@ -550,12 +571,14 @@ def chaotic_motion(table: Table) -> None:
         for index, text in enumerate(printed):
             as_printed, true, finer = (found[mode][index] for mode in ("as printed", "true", "finer"))
             table.number(
-                "5", f"bob {bob}, somersault {index + 1}", text, as_printed, true, bound(true, finer), "s", other
-            )
+                "5", f"bob {bob}, somersault {index + 1}", text, as_printed, true, bound(true, finer), "s", other,
+                _CHAOTIC,
+            )  # fmt: skip
     total = [upper_somersaults(moves[mode]).size + lower_somersaults(moves[mode]).size for mode in MODES]
     table.number("5", "somersaults of both bobs in 5 s", "9", *total, 0.0, "", other)
     as_printed, true, finer = (greatest(motion.potential1) for motion in moves.values())
-    table.number("5", "greatest PE1, at bob 1's somersaults", "0.39", as_printed, true, bound(true, finer), "J")
+    table.number("5", "greatest PE1, at bob 1's somersaults", "0.39", as_printed, true, bound(true, finer), "J",
+                 rounding=_CHAOTIC)  # fmt: skip
     exponents(table)
     parted = parting_time()
     table.statement("5", "an angle as printed is 0.1 rad from the true one", "5 s of motion", parted, parted, STEP, "s",
@@ -574,14 +597,17 @@ def exponents(table: Table) -> None:
     }
     time, running, converged = running_exponent()
     settled = float(time[np.abs(running / converged["exponent"] - 1) > 0.1].max()) + 1.0
-    wide = math.ceil(100 * converged["uncertainty"]) / 100
-    why = f"a value of 4 s; the converged exponent is {converged['exponent']:.2f} +- {wide:.2f}/s"
+    settled = 10 ** math.ceil(math.log10(settled))
+    wide = round_up(max(converged["uncertainty"], _LONG))
+    said = f"{show(converged['exponent'], wide)} +- {wide:g}/s"
+    why = f"a value of 4 s; the converged exponent is {said}"
     for name, fit in fits.items():
         slopes = [fit(*logs[mode]) for mode in MODES]
         finer = fit(*separation("true", 2)[:2])
-        table.number("5", f"lambda, {name}", "2.9", *slopes, bound(slopes[1], finer), "1/s", why)
-    table.number("5", "lambda, converged", "2.9", *2 * [converged["exponent"]], converged["uncertainty"], "1/s",
-                 f"the running exponent stays within 10 % of it from {settled:.0f} s on")  # fmt: skip
+        table.number("5", f"lambda, {name}", "2.9", *slopes, bound(slopes[1], finer), "1/s", why, _PARTING)
+    table.statement("5", "lambda, converged", "2.9", *2 * [converged["exponent"]], converged["uncertainty"], "1/s",
+                    False, f"it is {said}; the running exponent stays within 10 % of it from {settled} s on",
+                    _LONG)  # fmt: skip
 
 
 def misprints(table: Table) -> None:
@@ -631,7 +657,7 @@ def write_claims(path: Path) -> list[Claim]:
         rows = csv.writer(file)
         rows.writerow("section quantity printed as_printed true error_bound unit verdict".split())
         for c in found:
-            rows.writerow([c.section, c.quantity, c.printed, f"{c.as_printed:.10g}", f"{c.true:.12g}",
-                           f"{c.error:.1e}", c.unit, c.verdict])  # fmt: skip
+            rows.writerow([c.section, c.quantity, c.printed, show(c.as_printed, c.rounding), show(c.true, c.error),
+                           f"{c.error:g}", c.unit, c.verdict])  # fmt: skip
     draft.replace(path)
     return found

@@ -10,11 +10,23 @@ import time
 from pathlib import Path
 
 import numpy as np
+from digits import round_up, show
 
 import dpend
 from dpend import plots
 
 HERE = Path(__file__).parent
+
+
+# How far two processors may differ in an angle [deg], a period [s] and kappa relative to its size: no bound is less.
+ROUNDING = (1e-10, 1e-12, 1e-9)
+
+
+def shown(values: tuple[float, float, float], errors: tuple[float, float]) -> tuple[list[str], list[str]]:
+    """Partner, period and kappa to the digits that are known, and the bounds of the first two."""
+    bounds = [max(error, least) for error, least in zip(errors, ROUNDING, strict=False)]
+    digits = [show(value, bound) for value, bound in zip(values, bounds, strict=False)]
+    return [*digits, f"{values[2]:.8g}"], [f"{round_up(bound):g}" for bound in bounds]
 
 
 def main() -> None:
@@ -46,8 +58,9 @@ def main() -> None:
         partner = np.degrees(orbits.theta2)
         for i, theta1 in enumerate(degrees):
             stability = dpend.stability_class(float(orbits.kappa[i]))
-            values = (partner[i], orbits.period[i], orbits.kappa[i])
-            rows.append([branch, theta1, *(float(v) for v in values), stability, *(float(e[i]) for e in errors)])
+            values = (float(partner[i]), float(orbits.period[i]), float(orbits.kappa[i]))
+            digits, bounds = shown(values, (float(errors[0][i]), float(errors[1][i])))
+            rows.append([branch, f"{theta1:.10g}", *digits, stability, *bounds])
         stable = np.asarray(orbits.log_abs_kappa) <= 0
         for ax, y in zip(axes, (partner, np.asarray(orbits.period)), strict=True):
             ax.plot(degrees, y, style, color=colour, linewidth=1.2)
@@ -62,7 +75,7 @@ def main() -> None:
             table.writerow(names.split())
             table.writerows(rows)
     for row in rows[:: max(1, len(rows) // 10)]:
-        print("  {:10} theta1 {:7.2f} deg  theta2 {:16.11f} deg  T {:.13f} s  {}".format(*row[:4], row[5]))
+        print("  {:10} theta1 {:>6} deg  theta2 {:>16} deg  T {} s  {}".format(*row[:4], row[5]))
     axes[0].set(xlabel="theta1 (deg)", ylabel="theta2 (deg)", xticks=range(0, 181, 45), yticks=range(-180, 181, 45))
     axes[1].set(xlabel="theta1 (deg)", ylabel="period (s)", xticks=range(0, 181, 45), ylim=(0, None))
     axes[1].legend(fontsize="small", frameon=False, loc="upper left")

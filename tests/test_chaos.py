@@ -9,7 +9,7 @@ import pytest
 
 import dpend
 from dpend import Scheme, chaos
-from dpend.pendulum import equilibria
+from dpend.mechanics.pendulum import equilibria
 
 FAST = Scheme("rk8-circle-rescaled", 0.2)
 

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.main import get_command
 
-import dpend.atlas
-import dpend.scan
-from dpend import cli
+import dpend.catalogue.atlas
+import dpend.catalogue.scan
+from dpend import cli, report
 
 
 @pytest.fixture(autouse=True)
@@ -135,6 +136,9 @@ def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
         (("out", "."), "out must be a Zarr store of a sweep or a new name, got .:"),
         (("method", "rk4"), "step must be given with method"),
         (("error", "all"), "error must be None or"),
+        (("duration", "1e6"), "duration and step must leave at most 1e+06 steps to one motion"),
+        (("l1", "1e-300"), "duration and step must leave at most 1e+06 steps to one motion"),
+        (("most-steps", "1e3"), "duration and step must leave at most 0.001 steps to one motion and 1e+03 to all"),
     ],
 )
 def test_bad_maps_are_refused_in_one_line(capsys, tmp_path, change, text):
@@ -144,6 +148,25 @@ def test_bad_maps_are_refused_in_one_line(capsys, tmp_path, change, text):
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert text in err
     assert not (tmp_path / "m.zarr").exists()
+
+
+def test_a_damaged_map_is_mended_and_a_long_one_told(capsys, tmp_path, monkeypatch):
+    """One line each on standard error; the result is what it was."""
+    monkeypatch.setattr(cli, "_LONG", 0.0)
+    command = ("map", "flip", "--size", "8", "--duration", "1", "--out", tmp_path / "m.zarr")
+    status, _, err = run(capsys, *command)
+    assert (status, err.count("\n")) == (0, 1)
+    assert err.startswith("dpend: 32 cells to compute, about 1.5e+03 steps, which may take 0 minutes, and values of")
+    chunk = tmp_path / "m.zarr" / "flip_time" / "c" / "0" / "0"
+    right = chunk.read_bytes()
+    chunk.write_bytes(right[:-1])
+    monkeypatch.setattr(cli, "_LONG", 60.0)
+    status, _, err = run(capsys, *command)
+    assert (status, chunk.read_bytes()) == (0, right)
+    assert err == (
+        f"dpend: store {tmp_path / 'm.zarr'} is damaged: flip_time/c/0/0 has other bytes than were written; "
+        "what is damaged is made again, 1 of 4 tiles\n"
+    )
 
 
 def test_map_names_are_checked(capsys, tmp_path):
@@ -173,11 +196,12 @@ def test_what_did_not_converge_says_why(capsys):
     assert (status, orbit["status"]) == (1, "no_such_orbit")
     assert "largest" in orbit["message"]
     status, motion = run_json(capsys, "simulate", "--theta1", 170, "--theta2", 180, "--duration", 20, "--step", 0.002)
-    assert (status, motion["status"]) == (1, "beyond_horizon")
+    assert (status, motion["status"], motion["tolerance"]) == (1, "beyond_horizon", None)
+    assert f"{motion['error_estimate']:.1e} rad, is above 0.1 rad" in motion["message"]
 
 
 def test_nan_and_infinity_are_null(capsys):
-    cli._print_json({"a": float("nan"), "b": [float("inf"), 1.0]})
+    report.print_json({"a": float("nan"), "b": [float("inf"), 1.0]})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0]}
 
 
@@ -217,7 +241,7 @@ def test_a_failed_write_leaves_the_old_file(capsys, tmp_path, monkeypatch):
         path.write_text("half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(cli, "_write_csv", fails)
+    monkeypatch.setattr(report, "_write_csv", fails)
     arguments = ("simulate", "--theta1", 40, "--theta2", 10, "--duration", 1, "--step", 0.01, "--out", target)
     status, _, err = run(capsys, *arguments)
     assert (status, err) == (2, "dpend: disk full\n")
@@ -286,7 +310,13 @@ SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
         ((*SIMULATE, "--step", "0"), "step .*positive .* 0"),
         ((*SIMULATE, "--step", "2"), "step must not be longer than the motion"),
         ((*SIMULATE, "--step", "0.1", "--tolerance", "1e-6"), "step and tolerance exclude"),
-        ((*SIMULATE[:-1], "1e9", "--step", "1e-3"), "step must leave at most 100,000,000 states"),
+        (
+            (*SIMULATE[:-1], "1e9", "--step", "1e-3"),
+            "step must make at most 2,000,000 steps, got 0.001 s, .*most_steps",
+        ),
+        ((*SIMULATE, "--step", "5e-324"), "step must make at most 1e.12 steps"),
+        ((*SIMULATE, "--step", "1e-9"), "step must make at most 2,000,000 steps"),
+        ((*SIMULATE, "--g", "1e300"), "duration must be at most some .* more most_steps"),
         ((*SIMULATE[:-1], "1e9"), "duration must be at most"),
         ((*SIMULATE, "--method", "euler"), "method must be one of rk4, rk8"),
         ((*SIMULATE[:-1], "0"), "duration"),
@@ -385,10 +415,10 @@ def test_the_atlas_of_an_angle(capsys, tmp_path):
 
 def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
     def forgetful(*arguments):
-        result = dpend.scan.scanned(*arguments)
+        result = dpend.catalogue.scan.scanned(*arguments)
         return dataclasses.replace(result, zeros=result.zeros[1:])
 
-    monkeypatch.setattr(dpend.atlas, "scanned", forgetful)
+    monkeypatch.setattr(dpend.catalogue.atlas, "scanned", forgetful)
     status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
     assert (status, len(found["orbits"]), found["coverage"]["suspicious_cells"]) == (1, 4, 1)
 
@@ -401,3 +431,159 @@ def test_the_atlas_of_the_square(capsys, tmp_path):
     status, text, _ = run(capsys, "atlas", "--max-period", 1.0, "--store", store)
     assert status == 0
     assert "3 families" in text
+
+
+# A command, words that make it whole, and its options; every command has those of the pendulum, too.
+FUZZED = {
+    "orbit": (("--theta1", "40", "--branch", "in-phase"), "theta1 theta2 period branch symmetry ratio crossing"),
+    "family": (("--branch", "in-phase"), "branch out"),
+    "atlas": (("--theta1", "40", "--max-period", "1"), "theta1 max-period out store"),
+    "design": (
+        ("--theta1", "60", "--branch", "in-phase", "--period", "1"), "theta1 branch period kappa ratio free bounds"
+    ),
+    "simulate": (SIMULATE[1:], "theta1 theta2 duration p1 p2 method step tolerance most-steps out"),
+    "map": (
+        ("flip", "--size", "4", "--duration", "1", "--out", "m.zarr"),
+        "size duration theta1 theta2 tolerance method step error figure",
+    ),
+    "animate": ((*ANIMATE[1:], "--out", "f.gif"), "theta1 theta2 duration speed out"),
+    "fit": (("data.csv",), "free noise figure"),
+}  # fmt: skip
+HOSTILE = ("", "nan", "1e999", "1_000", "٤٠", "abc", "9" * 5000)
+MORE_HOSTILE = (
+    "-inf", "0x10", "1e", "=3", "-", " ", "1,5", "40 50", "\x1b[31m", "é" * 200, "None", "[]", "1:2:3", ",",
+    "no/such/place",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("values", [HOSTILE, pytest.param(MORE_HOSTILE, marks=pytest.mark.slow)], ids=["some", "more"])
+@pytest.mark.parametrize("command", FUZZED)
+def test_what_no_option_can_mean_is_refused_by_its_name(capsys, monkeypatch, tmp_path, command, values):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "app", get_command(cli.app))  # made once, not for each of two thousand calls
+    data = tmp_path / "data.csv"
+    data.write_text("time_s,theta1_deg,theta2_deg\n" + "\n".join(f"0.{i:02d},{i},{i}" for i in range(20)))
+    words, names = FUZZED[command]
+    wrong = []
+    for name in [*names.split(), "l1", "l2", "m1", "m2", "g"]:
+        for value in values:
+            others = [word for pair in _pairs(words, name) for word in pair]
+            status, out, err = run(capsys, command, *others, f"--{name}", value)
+            named = name in err.replace("_", "-")
+            told = value[:20].split(",")[0].strip() in err or repr(value)[1:20] in err or "got inf" in err
+            if (status, out, err.count("\n"), named, told) != (2, "", 1, True, True):
+                wrong.append((name, value[:30], status, out[:100], err[:200]))
+    assert wrong == []
+    assert list(tmp_path.iterdir()) == [data]
+
+
+def _pairs(words, name):
+    """The options among `words`, and what stands before them, without those called `name`."""
+    first = next((i for i, word in enumerate(words) if word.startswith("--")), len(words))
+    yield words[:first]
+    yield from (pair for pair in zip(words[first::2], words[first + 1 :: 2], strict=True) if pair[0] != f"--{name}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("orbit --theta1 40 --theta1 50", "--theta1 must be given once at most, got it 2 times"),
+        ("orbit --theta1 40 --json --json", "--json must be given once at most, got it 2 times"),
+        ("orbit --theta1 40 --crossing 2", "crossing must go with branch, got 2 alone"),
+        ("orbit --theta1 40 --branch in-phase --crossing 0", "crossing must be an integer of at least 1"),
+        ("orbit --theta1 40 --branch in-phase --crossing 9223372036854775808", "--crossing.* is beyond 92233720368547"),
+        ("orbit --theta1 40 --branch in-phase --crossing 1.0", "--crossing.*'1.0' is not an integer"),
+        ("orbit --theta1 40 --symmetry brake", "symmetry goes with guess"),
+        ("design --theta1 60 --branch in-phase --ratio 2", "branch must go with period or kappa, got 'in-phase'"),
+        ("design --theta1 60 --ratio 2 --free l1,,l2", "free must be names with commas between them, got 'l1,,l2'"),
+        ("design --theta1 60 --ratio 2 --bounds l1=1_0:2_0", "bounds must be NAME=A:B, got 'l1=1_0:2_0'"),
+        ("fit data.csv --free ,", "free must be names with commas between them, got ','"),
+        ("fit data.csv", "data must be a CSV file that can be read, got data.csv"),
+        ("fit data.png --figure data.png", "figure must be another file than data"),
+        ("fit data.png --figure ./data.png", "figure must be another file than data"),
+        ("atlas --max-period 1 --out s.json --store s.json", "out must be another file than store"),
+        ("simulate --theta1 40 --theta2 10 --duration 1 --most-steps 0", "most_steps must be an integer of at least 1"),
+        ("simulate --theta1 40 --theta2 10 --duration 1 --step 0.1 --most-steps 5", "step must make at most 5 steps"),
+        ("animate --theta1 9 --theta2 9 --duration 1 --out f.gif --l1 1e300 --l2 1e300", "duration must take at most"),
+    ],
+)  # fmt: skip
+def test_what_has_no_effect_or_two_meanings_is_refused(capsys, monkeypatch, tmp_path, arguments, line):
+    import re
+
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(capsys, *arguments.split())
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert re.search(line, err), err
+    assert list(tmp_path.iterdir()) == []
+
+
+# Pendulums at the ends of what is asked for, and beyond them.
+EXTREMES = [
+    f"--{name} {value}"
+    for name in ("l2", "m2", "g")
+    for value in ("1e-300", "1e-6", "1e6", "1e300")
+]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [*EXTREMES, "--g 0", "--g -9.8", "--l1 1e-300 --l2 1e-300", "--m1 1e300"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "simulate --theta1 90 --theta2 90 --duration 1",
+        "simulate --theta1 90 --theta2 90 --duration 1 --step 0.01",
+        "animate --theta1 90 --theta2 90 --duration 0.2 --out f.gif",
+        "animate --theta1 90 --theta2 90 --duration 0.2 --out f.png",
+        "fit data.csv",
+        "fit one.csv",
+    ],
+)
+def test_an_extreme_pendulum_is_computed_or_told(capsys, monkeypatch, tmp_path, command, options):
+    monkeypatch.chdir(tmp_path)
+    if command.startswith("fit"):
+        _write_data(tmp_path)
+    status, out, err = run(capsys, *command.split(), *options.split())
+    assert status in (0, 1, 2)
+    assert err.count("\n") == (status == 2)
+    assert bool(out) == (status != 2)
+    if status == 1:
+        assert ": " in out.splitlines()[-1]
+
+
+def _write_data(place):
+    """Three seconds of a motion with noise of half a degree: of both rods, and of the upper one alone."""
+    motion = dpend.simulate(dpend.Pendulum(), dpend.released(1.0, 0.5), 3.0, step=0.02, error=False)
+    noise = np.random.default_rng(0).normal(scale=0.5, size=(2, motion.time.size))
+    angles = np.degrees([motion.state.theta1, motion.state.theta2]) + noise
+    rows = list(zip(np.asarray(motion.time), *angles, strict=True))
+    both = "\n".join(f"{t:.3f},{a:.4f},{b:.4f}" for t, a, b in rows)
+    (place / "data.csv").write_text("time_s,theta1_deg,theta2_deg\n" + both)
+    (place / "one.csv").write_text("time_s,theta1_deg\n" + "\n".join(f"{t:.3f},{a:.4f}" for t, a, _ in rows))
+    changed = "\n".join(f"{t:.3f},{a * (1 if t < 1.5 else 0.0175):.4f},{b:.4f}" for t, a, b in rows)
+    (place / "changed.csv").write_text("time_s,theta1_deg,theta2_deg\n" + changed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", ["--noise 1e-12", "--noise 90", "--l2 1e-6 --m2 1e6", "--g -9.8 --at-rest"])
+@pytest.mark.parametrize("data", ["data.csv", "one.csv", "changed.csv"])
+def test_a_fit_of_what_cannot_be_says_so(capsys, monkeypatch, tmp_path, data, options):
+    monkeypatch.chdir(tmp_path)
+    _write_data(tmp_path)
+    status, out, err = run(capsys, "fit", data, *options.split())
+    assert status in (1, 2)
+    assert (err.count("\n"), bool(out)) == ((1, False) if status == 2 else (0, True))
+
+
+def test_a_noise_that_no_angle_has_is_refused(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    times = np.arange(40) / 20
+    rows = "\n".join(f"{t:.3f},{30 * np.cos(6 * t):.4f},{40 * np.cos(6 * t):.4f}" for t in times)
+    (tmp_path / "data.csv").write_text("time_s,theta1_deg,theta2_deg\n" + rows)
+    for noise in ("1e-300", "1e300"):
+        status, out, err = run(capsys, "fit", "data.csv", "--noise", noise)
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert "noise must be from 1e-15 rad" in err
+        assert noise.replace("1e3", "1e+3") in err
+    (tmp_path / "data.csv").write_text("time_s,theta1_deg,theta2_deg,theta2_deg\n" + rows.replace("\n", ",0\n") + ",0")
+    status, _, err = run(capsys, "fit", "data.csv")
+    assert (status, err) == (2, "dpend: data.csv must have one column theta2_deg, got 2: keep one of them\n")

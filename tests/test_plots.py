@@ -87,5 +87,5 @@ def test_a_family_is_solid_where_it_is_stable(paper):
     assert reach < lost
     assert np.sum((family.orbits.energy > reach) & (family.orbits.energy < lost)) == 0
     assert sum(len(mark.get_xdata()) for mark in marks) == len(family.special_points)
-    with pytest.raises(ValueError, match="plane must be angles or period"):
+    with pytest.raises(ValueError, match="plane must be one of angles, period, got 'momenta'"):
         plots.family(family, plane="momenta")

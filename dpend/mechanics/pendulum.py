@@ -1,0 +1,408 @@
+"""The pendulum: two point masses on massless rods in a plane, without friction or drive.
+
+Angles are absolute, from the downward vertical, positive anticlockwise; p1 and p2 are the canonical momenta. With
+delta = theta1 - theta2 and mu = m2/m1 the Hamiltonian is (Yamaguchi, section 2)
+
+    H = [p1^2/(2 m1 l1^2) + p2^2 (1 + mu)/(2 m2 l2^2) - p1 p2 cos(delta)/(m1 l1 l2)] / (1 + mu sin^2 delta)
+        - (m1 + m2) g l1 cos theta1 - m2 g l2 cos theta2.
+
+Every function takes leaves of any one shape, so grids of states and of pendulums need no `vmap`; what is no `Pendulum`
+or no `State` raises a ValueError. SI units throughout.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dpend._runtime import require_float64
+from dpend.checks import Scalar, coordinate, instance, known_number, known_value, number, one_shape, single
+from dpend.mechanics.trig import sincos
+
+Tree = TypeVar("Tree")
+
+
+def _register(cls: type[Tree]) -> type[Tree]:
+    """Make a dataclass whose constructor checks its numbers a JAX tree of its fields.
+
+    Libraries rebuild trees from leaves that are no numbers: masks, `None`, text, shapes, differences of lengths. So
+    unflattening fills the fields and never runs a check: any leaf passes. `register_dataclass` calls the constructor.
+    """
+    names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+    keys = [jax.tree_util.GetAttrKey(name) for name in names]
+
+    def flatten(tree: Tree) -> tuple[list[Any], None]:
+        return [getattr(tree, name) for name in names], None
+
+    def flatten_with_keys(tree: Tree) -> tuple[list[tuple[Any, Any]], None]:
+        return list(zip(keys, flatten(tree)[0], strict=True)), None
+
+    def unflatten(_: None, leaves: Iterable[Any]) -> Tree:
+        tree = object.__new__(cls)
+        for name, leaf in zip(names, leaves, strict=True):
+            object.__setattr__(tree, name, leaf)
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
+
+
+@_register
+@dataclass(frozen=True)
+class Pendulum:
+    """The parameters of a double pendulum; bob 1 hangs from the pivot, bob 2 from bob 1.
+
+    The defaults are those of Yamaguchi's paper. Whoever constructs one has its numbers checked and made float64, of
+    arrays the sign; tracers pass, and so does everything that libraries put into the tree by unflattening.
+
+    Attributes:
+        l1, l2: lengths of the rods [m], positive.
+        m1, m2: masses of the bobs [kg], positive.
+        g: acceleration of gravity [m/s^2], downwards; any finite number, but orbits and modes need g > 0.
+    Raises:
+        ValueError: a parameter is no finite number, or a length or mass not positive; arrays that do not broadcast.
+        RuntimeError: float64 is switched off in JAX.
+    """
+
+    l1: Scalar = 0.2
+    l2: Scalar = 0.2
+    m1: Scalar = 0.1
+    m2: Scalar = 0.1
+    g: Scalar = 9.8
+
+    def __post_init__(self) -> None:
+        require_float64()
+        for name, unit in (("l1", "m"), ("l2", "m"), ("m1", "kg"), ("m2", "kg")):
+            object.__setattr__(self, name, number(name, getattr(self, name), positive=True, unit=unit))
+        object.__setattr__(self, "g", number("g", self.g, unit="m/s^2"))
+        one_shape(**vars(self))
+
+
+@_register
+@dataclass(frozen=True)
+class State:
+    """A point of phase space, or many of one shape.
+
+    Attributes:
+        theta1, theta2: absolute angles from the downward vertical [rad], never wrapped.
+        p1, p2: canonical momenta [kg m^2/s].
+    Raises:
+        ValueError: a coordinate is no finite number; arrays that do not broadcast. An array, also a single number that
+            JAX has computed, may hold NaN: a motion that was lost.
+    """
+
+    theta1: Scalar
+    theta2: Scalar
+    p1: Scalar
+    p2: Scalar
+
+    def __post_init__(self) -> None:
+        for name, unit in (("theta1", "rad"), ("theta2", "rad"), ("p1", "kg m^2/s"), ("p2", "kg m^2/s")):
+            object.__setattr__(self, name, coordinate(name, getattr(self, name), unit=unit))
+        one_shape(**vars(self))
+
+
+def check_pendulum(pendulum: Any) -> None:
+    """Refuses what is no `Pendulum`.
+
+    Raises:
+        ValueError: another class.
+    """
+    instance("pendulum", pendulum, Pendulum, "dpend.Pendulum(l1=...)")
+
+
+def check_state(state: Any, name: str = "state") -> None:
+    """Refuses what is no `State`.
+
+    Raises:
+        ValueError: another class.
+    """
+    instance(name, state, State, "dpend.released(theta1, theta2) or dpend.State(theta1, theta2, p1, p2)")
+
+
+def check_mechanics(pendulum: Any, state: Any) -> None:
+    """Refuses what are no pendulum and no state, of any shape.
+
+    Raises:
+        ValueError: another class.
+    """
+    check_pendulum(pendulum)
+    check_state(state)
+
+
+def check_motion(pendulum: Any, state: Any) -> None:
+    """Refuses what are not one pendulum and one state; `jax.vmap` maps over many.
+
+    Raises:
+        ValueError: another class, or a leaf that is an array.
+    """
+    check_mechanics(pendulum, state)
+    for name, leaf in (*vars(pendulum).items(), *vars(state).items()):
+        single(name, leaf)
+
+
+def known_pendulum(pendulum: Any) -> Pendulum:
+    """A pendulum whose fields are plain numbers, for what no derivative goes through.
+
+    Raises:
+        ValueError: another class; a field that is an array, or traced by `jit` or a derivative.
+    """
+    check_pendulum(pendulum)
+    return Pendulum(**{name: known_number(name, leaf) for name, leaf in vars(pendulum).items()})
+
+
+class BobEnergies(NamedTuple):
+    """Energies of each bob [J], potential energies measured from that bob's place in the hanging equilibrium."""
+
+    kinetic1: Scalar
+    potential1: Scalar
+    kinetic2: Scalar
+    potential2: Scalar
+
+
+class Positions(NamedTuple):
+    """Where the bobs are [m]: x to the right, y upwards, the pivot at the origin."""
+
+    x1: Scalar
+    y1: Scalar
+    x2: Scalar
+    y2: Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class NormalMode:
+    """A small oscillation theta2 = ratio theta1 about the hanging state.
+
+    Attributes:
+        frequency: angular frequency [rad/s].
+        ratio: theta2/theta1, positive in the slow (in-phase) and negative in the fast (anti-phase) mode.
+        period: 2 pi/frequency [s].
+    """
+
+    frequency: Scalar
+    ratio: Scalar
+    period: Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Equilibria:
+    """The four equilibria, theta in {0, pi}^2, in the order (0, 0), (0, pi), (pi, 0), (pi, pi).
+
+    Attributes:
+        state: the states, leaves of shape (4,).
+        energy: H there [J], shape (4,).
+        exponents: of the linear flow [1/s], complex, shape (4, 2): each row lists the two that, taken with both signs,
+            make the four; real ones are rates of escape, imaginary ones frequencies.
+    """
+
+    state: State
+    energy: Scalar
+    exponents: Scalar
+
+
+def released(theta1: Scalar, theta2: Scalar) -> State:
+    """The state at rest with these angles [rad].
+
+    Raises:
+        ValueError: an angle is no finite number, as for `State`.
+    """
+    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
+    at_rest = jnp.zeros(jnp.broadcast_shapes(jnp.shape(theta1), jnp.shape(theta2)))
+    return State(theta1, theta2, at_rest, at_rest)
+
+
+def _relative_angle(state: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """sin theta1, sin theta2, and sine and cosine of delta = theta1 - theta2, from two calls."""
+    sin1, cos1 = sincos(state.theta1)
+    sin2, cos2 = sincos(state.theta2)
+    return sin1, sin2, sin1 * cos2 - cos1 * sin2, cos1 * cos2 + sin1 * sin2
+
+
+def _rates(pendulum: Pendulum, state: State, sin_delta: Scalar, cos_delta: Scalar) -> tuple[Scalar, Scalar]:
+    """The angular velocities M^-1 p, with the inertia matrix's determinant m2 l1^2 l2^2 (m1 + m2 sin^2 delta)."""
+    inertia1 = (pendulum.m1 + pendulum.m2) * pendulum.l1 * pendulum.l1
+    inertia2 = pendulum.m2 * pendulum.l2 * pendulum.l2
+    coupling = pendulum.m2 * pendulum.l1 * pendulum.l2 * cos_delta
+    scale = inertia2 * pendulum.l1 * pendulum.l1
+    inverse = 1.0 / (scale * pendulum.m1 + scale * pendulum.m2 * (sin_delta * sin_delta))
+    omega1 = (inertia2 * state.p1 - coupling * state.p2) * inverse
+    omega2 = (inertia1 * state.p2 - coupling * state.p1) * inverse
+    return omega1, omega2
+
+
+def hamiltonian(pendulum: Pendulum | Any, state: State | Any) -> Scalar:
+    """The energy H [J], zero for both bobs at rest at the pivot's height."""
+    check_mechanics(pendulum, state)
+    _, _, sin_delta, cos_delta = _relative_angle(state)
+    omega1, omega2 = _rates(pendulum, state, sin_delta, cos_delta)
+    _, cos1 = sincos(state.theta1)
+    _, cos2 = sincos(state.theta2)
+    weight1 = (pendulum.m1 + pendulum.m2) * pendulum.g * pendulum.l1
+    weight2 = pendulum.m2 * pendulum.g * pendulum.l2
+    return 0.5 * (state.p1 * omega1 + state.p2 * omega2) - weight1 * cos1 - weight2 * cos2
+
+
+def vector_field(pendulum: Pendulum | Any, state: State | Any) -> State:
+    """The time derivative of the state, Hamilton's equations of `hamiltonian`.
+
+    The force between the bobs is written with the velocities, m2 l1 l2 omega1 omega2 sin(delta), which is what the
+    derivative of the kinetic energy with respect to delta comes to: a third of the operations of the paper's form.
+
+    Returns:
+        State whose leaves are theta1' , theta2' [rad/s], p1', p2' [N m].
+    """
+    check_mechanics(pendulum, state)
+    sin1, sin2, sin_delta, cos_delta = _relative_angle(state)
+    omega1, omega2 = _rates(pendulum, state, sin_delta, cos_delta)
+    pull = (pendulum.m2 * pendulum.l1 * pendulum.l2) * (omega1 * omega2) * sin_delta
+    torque1 = ((pendulum.m1 + pendulum.m2) * pendulum.g * pendulum.l1) * sin1
+    torque2 = (pendulum.m2 * pendulum.g * pendulum.l2) * sin2
+    return State(omega1, omega2, -pull - torque1, pull - torque2)
+
+
+def velocities(pendulum: Pendulum | Any, state: State | Any) -> tuple[Scalar, Scalar]:
+    """The angular velocities theta1', theta2' [rad/s] that belong to the momenta."""
+    check_mechanics(pendulum, state)
+    _, _, sin_delta, cos_delta = _relative_angle(state)
+    return _rates(pendulum, state, sin_delta, cos_delta)
+
+
+def momenta(pendulum: Pendulum | Any, theta1: Scalar, theta2: Scalar, omega1: Scalar, omega2: Scalar) -> State:
+    """The state with these angles [rad] and angular velocities [rad/s]: p = M(delta) omega.
+
+    Raises:
+        ValueError: an angle or a velocity is no finite number, as for `State`.
+    """
+    check_pendulum(pendulum)
+    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
+    omega1, omega2 = coordinate("omega1", omega1, unit="rad/s"), coordinate("omega2", omega2, unit="rad/s")
+    _, cos_delta = sincos(theta1 - theta2)
+    coupling = pendulum.m2 * pendulum.l1 * pendulum.l2 * cos_delta
+    p1 = (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * omega1 + coupling * omega2
+    p2 = pendulum.m2 * pendulum.l2**2 * omega2 + coupling * omega1
+    return State(theta1, theta2, p1, p2)
+
+
+def energies(pendulum: Pendulum | Any, state: State | Any) -> BobEnergies:
+    """Kinetic and potential energy of each bob [J], the latter zero where that bob hangs at rest.
+
+    Their sum is H - H(hanging at rest). 1 - cos theta is computed as 2 sin^2(theta/2), exact for small angles too.
+    """
+    check_mechanics(pendulum, state)
+    omega1, omega2 = velocities(pendulum, state)
+    _, cos_delta = sincos(state.theta1 - state.theta2)
+    v1, v2 = pendulum.l1 * omega1, pendulum.l2 * omega2
+    rise1 = 2 * pendulum.l1 * sincos(0.5 * state.theta1)[0] ** 2
+    rise2 = rise1 + 2 * pendulum.l2 * sincos(0.5 * state.theta2)[0] ** 2
+    return BobEnergies(
+        kinetic1=0.5 * pendulum.m1 * v1**2,
+        potential1=pendulum.m1 * pendulum.g * rise1,
+        kinetic2=0.5 * pendulum.m2 * (v1**2 + v2**2 + 2 * v1 * v2 * cos_delta),
+        potential2=pendulum.m2 * pendulum.g * rise2,
+    )
+
+
+def energy_scale(pendulum: Pendulum, state: State) -> Scalar:
+    """What an energy error is measured against [J]: the weights' torques plus the kinetic energy of `state`.
+
+    Half the range of the potential energy for a pendulum that moves under gravity; the kinetic energy where g = 0.
+    """
+    weights = (pendulum.m1 + pendulum.m2) * pendulum.l1 + pendulum.m2 * pendulum.l2
+    kinetic = energies(pendulum, state)
+    return weights * jnp.abs(pendulum.g) + kinetic.kinetic1 + kinetic.kinetic2
+
+
+def positions(pendulum: Pendulum | Any, state: State | Any) -> Positions:
+    """Where the bobs are [m]: x to the right, y upwards, the pivot at the origin."""
+    check_mechanics(pendulum, state)
+    sin1, cos1 = sincos(state.theta1)
+    sin2, cos2 = sincos(state.theta2)
+    x1, y1 = pendulum.l1 * sin1, -pendulum.l1 * cos1
+    return Positions(x1, y1, x1 + pendulum.l2 * sin2, y1 - pendulum.l2 * cos2)
+
+
+def normal_modes(pendulum: Pendulum | Any) -> tuple[NormalMode, NormalMode]:
+    """The two small oscillations about the hanging state, slow (in-phase) first.
+
+    A mode swings like a simple pendulum of length L with (L - l1)(L - l2) = kappa l1 l2, kappa = m2/(m1 + m2), so
+    omega^2 = g/L and theta2/theta1 = l1/(L - l2). Both roots are written without cancellation, for any mass ratio.
+
+    Raises:
+        ValueError: g is a number that is not positive: nothing swings.
+    """
+    check_pendulum(pendulum)
+    gravity = None if np.ndim(pendulum.g) else known_value(pendulum.g)
+    if gravity is not None and not gravity > 0:
+        raise ValueError(f"g must be positive for normal modes, got {gravity}: nothing swings without gravity")
+    return _modes(pendulum, pendulum.g)
+
+
+def _modes(pendulum: Pendulum, gravity: Scalar) -> tuple[NormalMode, NormalMode]:
+    """The normal modes under another gravity, which is not looked at."""
+    l1, l2 = pendulum.l1, pendulum.l2
+    share = pendulum.m2 / (pendulum.m1 + pendulum.m2)
+    difference = l1 - l2
+    root = jnp.sqrt(difference**2 + 4 * share * l1 * l2)
+    # root + |difference| never cancels, and (root + difference)(root - difference) = 4 share l1 l2.
+    larger = root + jnp.abs(difference)
+    smaller = 4 * share * l1 * l2 / larger
+    plus, minus = jnp.where(difference > 0, larger, smaller), jnp.where(difference > 0, smaller, larger)
+    long = 0.5 * (l1 + l2 + root)
+    short = pendulum.m1 / (pendulum.m1 + pendulum.m2) * l1 * l2 / long
+
+    def mode(length: Scalar, ratio: Scalar) -> NormalMode:
+        frequency = jnp.sqrt(gravity / length)
+        return NormalMode(frequency, ratio, 2 * jnp.pi / frequency)
+
+    return mode(long, 2 * l1 / plus), mode(short, -2 * l1 / minus)
+
+
+def fast_frequency(pendulum: Pendulum) -> Scalar:
+    """The fast mode's angular frequency [rad/s] for |g|: where gravity pulls upwards, the fastest rate of escape."""
+    return _modes(pendulum, jnp.abs(pendulum.g))[1].frequency
+
+
+def equilibria(pendulum: Pendulum | Any) -> Equilibria:
+    """The four equilibria with the exponents of the linear flow about them.
+
+    About (s1, s2) = (cos theta1, cos theta2) = (+-1, +-1) a solution exp(lambda t) has lambda^2 = g/q with
+    (q + s1 l1)(q + s2 l2) s1 s2 = kappa l1 l2 s1 s2, kappa = m2/(m1 + m2); both q are real.
+
+    Raises:
+        ValueError: leaves that are arrays: `jax.vmap` maps over many.
+    """
+    check_pendulum(pendulum)
+    for name, leaf in vars(pendulum).items():
+        single(name, leaf)
+    angles = np.array([[0.0, 0.0], [0.0, np.pi], [np.pi, 0.0], [np.pi, np.pi]]).T
+    signs = jnp.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
+    l1, l2, m1, m2, g = (jnp.asarray(value, jnp.float64) for value in jax.tree.leaves(pendulum))
+    share = m2 / (m1 + m2)
+    mixed = signs[0] * signs[1]
+    half = 0.5 * (signs[0] * l1 + signs[1] * l2)  # q^2 + 2 half q + mixed (1 - share) l1 l2 = 0
+    root = jnp.sqrt(0.25 * (l1 - l2) ** 2 + jnp.where(mixed > 0, share, 1 - share) * l1 * l2)
+    far = -(half + jnp.where(half < 0, -root, root))
+    near = mixed * (1 - share) * l1 * l2 / far
+    exponents = jnp.sqrt((g / jnp.stack([far, near], axis=-1)).astype(jnp.complex128))
+    energy = -(m1 + m2) * g * l1 * signs[0] - m2 * g * l2 * signs[1]
+    zero = jnp.zeros(4)
+    return Equilibria(State(jnp.asarray(angles[0]), jnp.asarray(angles[1]), zero, zero), energy, exponents)
+
+
+def fastest(pendulum: Pendulum, state: State) -> Scalar:
+    """The rate that decides the step [rad/s]: of the linear motion, of the rods, and of the inertia they share.
+
+    The last is 1/(1 + mu sin^2 delta), which a heavy lower bob makes narrow: it changes when the angle delta between
+    the rods does by sqrt(sin^2 delta + 1/mu). Near no equilibrium do motions part faster than the linear share.
+    """
+    rates = vector_field(pendulum, state)
+    mu = pendulum.m2 / pendulum.m1
+    sin_delta, _ = sincos(state.theta1 - state.theta2)
+    narrow = (1 + mu) / (1 + mu * sin_delta**2)
+    spin = rates.theta1**2 + rates.theta2**2 + narrow * (rates.theta1 - rates.theta2) ** 2
+    return jnp.sqrt(fast_frequency(pendulum) ** 2 + spin)

@@ -1,0 +1,140 @@
+"""The curve through the points of a family, in NumPy: parts of it, both ways of it, and its return to itself."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dpend.orbits.newton import METRIC, Corrected
+from dpend.orbits.walk import hermite
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Points of a curve with unit tangents; of a family that begins in a normal mode, the mode itself is the first."""
+
+    points: np.ndarray
+    tangents: np.ndarray
+    steps: np.ndarray
+
+    @property
+    def lengths(self) -> np.ndarray:
+        ways = np.diff(self.points, axis=0)
+        return np.sqrt(np.sum(METRIC * ways**2, axis=1))
+
+    def between(self, index: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Points at shares of the intervals `index`, by cubics."""
+        start, end = self.points[index].T, self.points[index + 1].T
+        slope, end_slope = self.tangents[index].T, self.tangents[index + 1].T
+        return np.asarray(hermite(start, slope, end, end_slope, self.lengths[index], share)).T
+
+    def tangents_between(self, index: np.ndarray, share: np.ndarray) -> np.ndarray:
+        mixed = (1 - share)[:, None] * self.tangents[index] + share[:, None] * self.tangents[index + 1]
+        return mixed / np.sqrt(np.sum(METRIC * mixed**2, axis=1))[:, None]
+
+
+# Points at the beginning that are not looked at for a return; and what counts as one [rad, and log of the time].
+LEAVING, SAME_PLACE = 4, 1e-7
+
+
+def cut_at_return(rows: Corrected, count: int) -> tuple[Corrected, str]:
+    """A curve that has come back after `count` points: closed, unless it only turned round at a branch point.
+
+    Where it meets a more symmetric family, a curve goes on through the same orbits, met at their other rests, as often
+    as it took to get there.
+    """
+    rows = some_of(rows, slice(count))
+    lengths = np.cumsum(curve_of(rows).lengths)
+    (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
+    half = [i for i in crossings if abs(lengths[i] - 0.5 * lengths[-1]) < _MIDDLE * lengths[-1]]
+    return (some_of(rows, slice(half[0] + 1)), "branch point") if half else (rows, "closed")
+
+
+def without_its_image(rows: Corrected, ends: tuple[str, str], here: int) -> tuple[Corrected, tuple[str, str]]:
+    """The part of a curve of brake orbits with the point `here` that does not hold them a second time, and its ends.
+
+    Through a branch point, where its orbits become more symmetric ones, a curve goes on with the same orbits, met at
+    their other rests.
+    """
+    (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
+    for i in crossings.tolist():
+        if not _reflects(rows, i):
+            continue
+        if here <= i:
+            return without_its_image(some_of(rows, slice(i + 1)), (ends[0], "branch point"), here)
+        return without_its_image(some_of(rows, slice(i + 1, None)), ("branch point", ends[1]), here - i - 1)
+    return rows, ends
+
+
+def half_of_closed(rows: Corrected) -> Corrected | None:
+    """Of a closed curve that holds its orbits twice, from a branch point to another and back, the half it begins in."""
+    (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
+    if crossings.size < 2 or not _reflects(rows, crossings[0]):
+        return None
+    return joined(some_of(rows, slice(crossings[-1] + 1, None)), some_of(rows, slice(crossings[0] + 1)))
+
+
+def _reflects(rows: Corrected, crossing: Any) -> bool:
+    """Whether the points on both sides of a crossing are each other's images: their orbits' other rests, in the mirror
+    or not.
+    """
+    shorter, longer = sorted(
+        (some_of(rows, slice(crossing + 1)), some_of(rows, slice(crossing + 1, None))), key=lambda part: len(part.point)
+    )
+    if len(shorter.point) < LEAVING:
+        return False
+    at = len(shorter.point) // 2  # far from the branch point, where all is close to all
+    curve = release_and_time(longer)
+    for sign in (1.0, -1.0):
+        image = np.append(sign * shorter.end[at, :2], release_and_time(shorter)[at, 2])
+        away, lengths = away_from(curve[:-1], curve[1:], image)
+        nearest = int(np.argmin(away))
+        if away[nearest] < _IMAGE * lengths[nearest]:
+            return True
+    return False
+
+
+# How near to a chord an image is, as a share of its length.
+_IMAGE = 0.05
+# How far from the middle of its way a curve may have turned round, as a share of it.
+_MIDDLE = 0.1
+
+
+def release_and_time(rows: Corrected) -> np.ndarray:
+    """(theta1, theta2, log of the time), which tell orbits of one symmetry apart."""
+    return np.concatenate([rows.point[:, :2], np.log(rows.times.sum(axis=1))[:, None]], axis=1)
+
+
+def way_to(where: np.ndarray, release: np.ndarray) -> np.ndarray:
+    """From one (theta1, theta2, log of the time) to the other, angles modulo 2 pi; shape (..., 3)."""
+    way = release - where
+    way[..., :2] -= 2 * np.pi * np.round(way[..., :2] / (2 * np.pi))
+    return way
+
+
+def away_from(start: np.ndarray, end: np.ndarray, release: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far a release is from the chords between points, and how long these are, shape (n,) both."""
+    chord, to = end - start, way_to(start, release)
+    length = np.maximum(np.linalg.norm(chord, axis=1), np.finfo(float).tiny)
+    share = np.clip(np.sum(to * chord, axis=1) / length**2, 0.0, 1.0)
+    return np.linalg.norm(to - share[:, None] * chord, axis=1), length
+
+
+def some_of(rows: Corrected, which: Any) -> Corrected:
+    return Corrected(*(column[which] for column in rows))
+
+
+def joined(*parts: Corrected) -> Corrected:
+    return Corrected(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def turned(rows: Corrected) -> Corrected:
+    """The same points, met in the opposite order."""
+    back = some_of(rows, slice(None, None, -1))
+    return back._replace(
+        tangent=-back.tangent, time_slope=-back.time_slope, energy_slope=-back.energy_slope, side=-back.side
+    )
+
+
+def curve_of(rows: Corrected) -> Curve:
+    return Curve(rows.point, rows.tangent, rows.steps)

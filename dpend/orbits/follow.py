@@ -1,0 +1,259 @@
+"""Continuation: points of a family, the curve through them, its ends, and arcs for the families that branch off.
+
+Between the compiled walk (`walk`) and what users see (`family`). All in natural units and in NumPy: what is done
+here between two calls of compiled code is done once in 32 points.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import jax
+import numpy as np
+
+from dpend.checks import Scalar
+from dpend.mechanics.pendulum import Pendulum
+from dpend.orbits.arc import PARTS, SEGMENTS, UNKNOWNS, Arc, arc_of, laid
+from dpend.orbits.curve import (
+    LEAVING,
+    SAME_PLACE,
+    Curve,
+    curve_of,
+    cut_at_return,
+    joined,
+    release_and_time,
+    some_of,
+    way_to,
+)
+from dpend.orbits.newton import METRIC, Corrected, linearised, unpacked
+from dpend.orbits.walk import CHUNK, NEARLY, Tasks, Walk, walk
+
+# Resonances k:n are told, and followed, up to this k.
+LARGEST_COVER = 6
+# Steps in a segment where none were counted yet.
+_MANY_STEPS = 40
+# Singular values below this share of the largest are zero.
+_NO_RANK = 1e-3
+# How far along the new direction the branch is looked for, and how much further to its side it may be.
+_ONTO_BRANCH, _ASTRAY = (0.02, 0.005, 0.05, 0.001), 2.0
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far a family is followed: the longest step in arclength, the most points, and the longest period."""
+
+    step: float
+    points: int
+    period: float
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Problem:
+    """What is followed: the pendulum as it was given, which may carry derivatives, and the same in natural units."""
+
+    pendulum: Pendulum
+    natural: Pendulum = field(metadata={"static": True})
+    symmetry: str = field(metadata={"static": True})
+    turns: tuple[float, float] = field(metadata={"static": True})
+
+    @property
+    def arc(self) -> Arc:
+        return arc_of(self.symmetry, self.turns)
+
+    def corrected(self, points: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> Corrected:
+        """The points of the family in the planes through `points` that `rows` are normal to."""
+        tables = []
+        for first in range(0, len(points), CHUNK):
+            some = slice(first, first + CHUNK)
+            count = len(points[some])
+            tasks = Tasks(_padded(points[some]), _padded(rows[some]), _padded(steps[some]).astype(int), np.int64(count))
+            _, table, _, _ = walk(self.natural, begun(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc)
+            tables.append(np.asarray(table)[:count])
+        return unpacked(np.concatenate(tables))
+
+    def followed(self, start: Walk, origin: Corrected | None, reach: Reach) -> tuple[Corrected, str]:
+        """The points after `start`, and what the family's end is; `origin` is the place it could come back to."""
+        nothing = np.zeros((CHUNK, UNKNOWNS))
+        tasks = Tasks(nothing, nothing, nothing[:, 0].astype(int), np.int64(0))
+        tables: list[np.ndarray] = []
+        count, end, begin = 0, "", start
+        while not end and count < reach.points:
+            start, table, more, status = walk(self.natural, start, np.float64(reach.step), tasks, self.arc)
+            tables.append(np.asarray(table)[: int(more)])
+            rows, count = unpacked(np.concatenate(tables)), count + int(more)
+            end = ("", "ended", "lost")[int(status)]
+            if end == "lost" and len(rows.point) and self._near_limit(rows):
+                end = "ended"
+            (longer,) = np.nonzero(self.period(rows) > reach.period)
+            if longer.size:
+                rows = some_of(rows, slice(longer[0] + 1))
+            back = None if origin is None else self._back(origin, rows, count - int(more))
+            if back is not None:
+                return cut_at_return(rows, back)
+            if longer.size:
+                return self._ending_at(reach.period, begin, rows), "longest period"
+        if count > reach.points:
+            return some_of(rows, slice(reach.points)), "unfinished"
+        if end == "ended":
+            end = "homoclinic" if self._slows(rows) else "normal mode"
+        return rows, end or "unfinished"
+
+    def period(self, rows: Corrected) -> np.ndarray:
+        return np.asarray(PARTS[self.symmetry] * rows.times.sum(axis=1))
+
+    def _ending_at(self, period: float, begin: Walk, rows: Corrected) -> Corrected:
+        """The rows, the last of which takes longer than `period`, with one of that period in its place; without, if
+        the family was that long from its beginning.
+        """
+        last = curve_of(some_of(rows, slice(-2, None)))
+        if len(rows.point) == 1:
+            points, tangents = np.vstack([begin.point, last.points]), np.vstack([begin.tangent, last.tangents])
+            last = Curve(points, tangents, np.append(last.steps, last.steps))
+        place, share = np.zeros(1, int), np.ones(1)
+        end = some_of(rows, slice(-1, None))
+        for _ in range(_APPROACH):
+            rate = end.time_slope / end.times.sum(axis=1) * last.lengths
+            share = np.clip(share - np.log(self.period(end) / period) / rate, 0.0, 1.0)
+            tangent = last.tangents_between(place, share)
+            end = self.corrected(last.between(place, share), METRIC * tangent, last.steps[1:])
+        found = end.converged[0] and abs(math.log(self.period(end)[0] / period)) < SAME_PLACE
+        return joined(some_of(rows, slice(-1)), end) if found else some_of(rows, slice(-1))
+
+    def on_curve(self, point: np.ndarray) -> Corrected | None:
+        """The point of the family near one that is nearly on it, its tangent not known; None if there is none."""
+        row, steps = np.zeros(UNKNOWNS), np.array([_MANY_STEPS])
+        row[[0, 1, -2]] = 0.6, 0.4, 1.0  # crosses any curve but by accident
+        for _ in range(3):
+            rows = self.corrected(point[None], row[None], steps)
+            if not rows.converged[0]:
+                return None
+            point, row, steps = rows.point[0], METRIC * rows.tangent[0], rows.steps
+        return rows
+
+    def onto_branch(self, base: Corrected, point: np.ndarray, sign: float) -> Corrected | None:
+        """The first point of a branch that leaves the family of `base`, from that orbit's own point on this problem;
+        None if nothing is met.
+        """
+        for _ in range(3):  # onto the orbit, by the shortest ways: the equations have rank two less than unknowns here
+            value, jacobian = (np.asarray(x) for x in linearised(self.natural, point, _MANY_STEPS, self.arc))
+            point = point - np.linalg.pinv(jacobian, rcond=_NO_RANK) @ value
+        _, sizes, directions = np.linalg.svd(jacobian)
+        if sizes[-1] > _NO_RANK * sizes[0]:
+            return None
+        kernel = directions[-2:] / np.sqrt(np.sum(METRIC * directions[-2:] ** 2, axis=1))[:, None]
+        # The family's own direction is the one whose first node moves as the family's does.
+        own = np.linalg.lstsq(kernel[:, :4].T, base.tangent[0, :4], rcond=None)[0] @ kernel
+        own /= np.sqrt(own @ (METRIC * own))
+        new = kernel[np.argmin(np.abs(kernel @ (METRIC * own)))]
+        new = new - (new @ (METRIC * own)) * own
+        new *= np.sign(new[np.argmax(np.abs(new))]) / np.sqrt(new @ (METRIC * new))
+        new *= sign
+        for size in _ONTO_BRANCH:
+            steps = np.array([_MANY_STEPS])
+            for _ in range(2):
+                rows = self.corrected((point + size * new)[None], (METRIC * new)[None], steps)
+                steps = rows.steps
+            strayed = rows.point[0] - point - size * new
+            if rows.converged[0] and np.sqrt(strayed @ (METRIC * strayed)) < _ASTRAY * size:
+                return rows
+        return None
+
+    @property
+    def levels(self) -> np.ndarray:
+        """The energies of the equilibria: hanging, with one rod upright, upright. In NumPy: eager JAX would compile."""
+        upper, lower = float(1 + self.natural.m2), float(self.natural.m2 * self.natural.l2)
+        return np.array([-upper - lower, lower - upper, upper - lower, upper + lower])
+
+    def _slows(self, rows: Corrected) -> bool:
+        """Whether the time at the end grows like the logarithm of the distance from an equilibrium's energy."""
+        gap = np.min(np.abs(rows.energy[-1] - self.levels))
+        return bool(abs(rows.time_slope[-1]) * gap > 1e-3 * abs(rows.energy_slope[-1]))
+
+    def _near_limit(self, rows: Corrected) -> bool:
+        """Whether a family was lost where rounding, magnified by the inverse distance, keeps it from its end."""
+        gap = np.min(np.abs(rows.energy[-1] - self.levels[1:])) / self.levels[3]
+        return bool(gap < NEARLY and abs(rows.energy_slope[-1]) < 1e3 * NEARLY * self.levels[3])
+
+    def _back(self, origin: Corrected, rows: Corrected, since: int) -> int | None:
+        """How many points it takes the curve to come back to `origin`, an orbit that it may meet at its other rest."""
+        curve = curve_of(rows)
+        own = release_and_time(origin)[0]
+        other = origin.end[0, :2] if self.symmetry == "brake" else 2 * np.pi * np.asarray(self.turns) - own[:2]
+        where = release_and_time(rows)
+        for i in range(max(since - 1, LEAVING), len(where) - 1):
+            chord = where[i + 1] - where[i]
+            for release in (own, np.append(other, own[2])):
+                apart = way_to(where[i], release)
+                share = apart @ chord / (chord @ chord)
+                near = np.linalg.norm(apart - share * chord) < 0.1 * np.linalg.norm(chord)
+                if -0.1 < share < 1.1 and near and self._meets(curve, i, share, release):
+                    return i + 1
+        return None
+
+    def _meets(self, curve: "Curve", i: int, share: float, release: np.ndarray) -> bool:
+        """Whether the curve goes through the release, looked at on the curve itself."""
+        for _ in range(4):
+            index, shares = np.array([i]), np.array([share])
+            tangent = curve.tangents_between(index, shares)
+            rows = self.corrected(curve.between(index, shares), METRIC * tangent, curve.steps[index + 1])
+            apart = way_to(release_and_time(rows)[0], release)
+            slope = np.append(rows.tangent[0, :2], rows.time_slope[0] / rows.times[0].sum())
+            share += float(apart @ slope / (slope @ slope) / curve.lengths[i])
+        return bool(np.linalg.norm(apart) < SAME_PLACE)
+
+
+# Newton's iterations for the orbit of a period, from the end of a step.
+_APPROACH = 6
+
+
+def begun(point: np.ndarray, tangent: np.ndarray, step: Scalar, steps: Scalar) -> Walk:
+    # Always of these types: compiled code is keyed by them.
+    length, size, side = np.array([0.0, step, 0.0])
+    count, leap = np.array([steps, 0]).astype(int)
+    return Walk(point, tangent, point, tangent, length, size, side, count, tangent, leap)
+
+
+def _padded(array: np.ndarray) -> np.ndarray:
+    missing = CHUNK - len(array)
+    return np.concatenate([array, np.repeat(array[:1], missing, axis=0)])
+
+
+def laid_out(problem: Problem, times: np.ndarray, states: np.ndarray, duration: float) -> np.ndarray:
+    """A point to be corrected for an arc of `duration` on an orbit of which some states are known."""
+    missing = _KNOWN - len(times)
+    times = np.append(times, np.full(missing, np.inf))
+    states = np.vstack([states, np.zeros((missing, 4))])
+    return np.asarray(laid(problem.natural, times, states, duration))
+
+
+# Room for the known states of six periods of a centred orbit, so that the laying of arcs compiles once.
+_KNOWN = 4 * SEGMENTS * LARGEST_COVER
+
+
+def _unrolled(problem: Problem, rows: Corrected) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states known on half a period of an orbit: its nodes and, if it is centred, their images about T/4."""
+    states = rows.point[0, : 4 * SEGMENTS].reshape(SEGMENTS, 4)
+    times = np.concatenate([[0.0], np.cumsum(rows.times[0])])
+    if problem.symmetry != "centred":
+        return times[:-1], states
+    images = states[:0:-1] * [-1, -1, 1, 1] + 2 * np.pi * np.append(problem.turns, [0, 0])
+    centre = rows.end[0]
+    return np.append(times, 2 * times[-1] - times[-2:0:-1]), np.vstack([states, centre, images])
+
+
+def repeated(problem: Problem, rows: Corrected, halves: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states known on so many halves of an orbit's period."""
+    times, states = _unrolled(problem, rows)
+    half = rows.times[0].sum() * PARTS[problem.symmetry] / 2
+    all_times, all_states = [times], [states]
+    for i in range(1, halves):
+        if problem.symmetry == "brake":
+            # Each rest reflects time: the second half is the first, backwards, with the momenta turned round.
+            back = np.append(half, times[:0:-1]), np.vstack([rows.end[0], states[:0:-1]]) * [1, 1, -1, -1]
+            later = (half - back[0], back[1]) if i % 2 else (times, states)
+        else:
+            opposite = 2 * np.pi * np.append(problem.turns, [0, 0]) - states
+            later = (times, opposite if i % 2 else states)
+        all_times.append(i * half + later[0])
+        all_states.append(later[1])
+    return np.concatenate(all_times), np.concatenate(all_states)
