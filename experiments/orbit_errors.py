@@ -103,6 +103,7 @@ def orbits_of(pendulum, branch, rng, most_points, long_ways):
                 yield f"find_orbit(guess), {symmetry}", found, None
     if long_ways:
         yield "find_orbit(branch)", dpend.find_orbit(pendulum, wanted[0], branch=branch), None
+    if long_ways and family.status == Status.CONVERGED:  # to the end, which of some pendulums takes thousands of points
         ratio = 1 if branch == "in-phase" else -1
         yield "find_orbit(ratio)", dpend.find_orbit(pendulum, 0.5 * reach, ratio=ratio), ratio
 
@@ -119,6 +120,7 @@ def measure(pendulums, seed=0, most_points=150, seconds=np.inf):
     rng, truth, rows, left_out, begun = np.random.default_rng(seed), Truth(), [], 0, time.perf_counter()
     for i in range(pendulums):
         if time.perf_counter() - begun > seconds:
+            print(f"stopped after {i} of {pendulums} pendulums")
             break
         pendulum, branch = random_pendulum(rng), ("in-phase", "anti-phase")[i % 2]
         for kind, orbit, ratio in orbits_of(pendulum, branch, rng, most_points, i % 8 < 2):
