@@ -22,9 +22,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType, TracebackType
 
-import jax
-import jaxlib
-
 
 def _is_program() -> bool:
     """Whether this process is the command line: its script, or `python -m dpend.cli`."""
@@ -67,6 +64,9 @@ def _tell_in_one_line(kind: type[BaseException], error: BaseException, trace: Tr
 
 if _is_program():
     leave_quietly()
+
+import jax  # noqa: E402
+import jaxlib  # noqa: E402
 
 PLAIN = "DPEND_PLAIN_JAX"
 

@@ -308,7 +308,7 @@ def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
     with _bar(on_terminal(), unit) as show:
         started = last = time.perf_counter()
 
-        def tell(done: float, planned: float) -> None:
+        def tell(done: int | float, planned: int | float) -> None:
             nonlocal last
             show(done, planned)
             if not on_terminal() and time.perf_counter() - last > _BETWEEN_LINES:

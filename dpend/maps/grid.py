@@ -3,6 +3,7 @@
 import hashlib
 import inspect
 import json
+import tokenize
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -77,7 +78,7 @@ class Keyed:
         own = getattr(inner, "__qualname__", type(inner).__qualname__)
         try:
             source = inspect.getsource(inner)
-        except (OSError, TypeError):
+        except (OSError, TypeError, SyntaxError, tokenize.TokenError):  # another file stands where it was written
             source = ""
         if strict and name is None:
             if "<" in own or getattr(inner, "__closure__", None):

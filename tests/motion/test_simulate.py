@@ -196,7 +196,7 @@ def test_a_tolerance_holds_on_the_whole_square(paper, duration, tolerance):
     for theta1, theta2 in angles:
         release = dpend.released(theta1, theta2)
         motion = dpend.simulate(paper, release, duration, tolerance=tolerance)
-        assert motion.status in (Status.CONVERGED, Status.BEYOND_HORIZON)
+        assert motion.status in (Status.CONVERGED, Status.BEYOND_HORIZON, Status.TOLERANCE_NOT_REACHED)
         if motion.status == Status.CONVERGED:
             assert motion.error_estimate <= tolerance
             error, unknown = error_of(motion, paper, release)
@@ -301,7 +301,7 @@ def test_reference_knows_its_error(paper, tolerance):
         found = dpend.reference(paper, dpend.released(theta1, theta2), [0.5, 1.0, 2.0], tolerance=tolerance)
         exact = extended.motion((0.2, 0.2, 0.1, 0.1, 9.8), (theta1, theta2, 0.0, 0.0), [0.5, 1.0, 2.0])
         ours = np.stack([np.asarray(found.state.theta1), np.asarray(found.state.theta2)], axis=1)
-        assert np.max(np.abs(ours - exact[:, :2])) < found.error_estimate < 1e-3
+        assert float(np.max(np.abs(ours - exact[:, :2]))) < found.error_estimate < 1e-3
 
 
 @pytest.mark.slow

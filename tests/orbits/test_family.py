@@ -324,7 +324,8 @@ def test_derivatives_that_do_not_exist():
     for theta1, there in ((outer - 1e-3, True), (outer + 1e-3, False), (inner + 1e-3, True), (inner - 1e-3, False)):
         again = dpend.find_orbit(heavy_below, theta1, branch="in-phase", crossing=2)
         assert (again.status == Status.CONVERGED and again.theta1 < 0.4) == there
-    assert all(abs(fold.slopes.theta1) < 1e-10 < abs(fold.slopes.theta2) for fold in folds)
+    # A fold is known to its own error [arclength], over which the slope changes by some tens of that.
+    assert all(abs(fold.slopes.theta1) < max(1e-10, fold.error_estimate[0]) < abs(fold.slopes.theta2) for fold in folds)
     near = float(folds[0].orbit.theta1) * (1 - 1e-14)
     with pytest.raises(ValueError, match=r"theta1 must not be a fold .* got 0\.31.*slopes"):
         jax.grad(lambda theta1: family.at(theta1).period)(near)
