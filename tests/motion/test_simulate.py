@@ -301,7 +301,7 @@ def test_reference_knows_its_error(paper, tolerance):
         found = dpend.reference(paper, dpend.released(theta1, theta2), [0.5, 1.0, 2.0], tolerance=tolerance)
         exact = extended.motion((0.2, 0.2, 0.1, 0.1, 9.8), (theta1, theta2, 0.0, 0.0), [0.5, 1.0, 2.0])
         ours = np.stack([np.asarray(found.state.theta1), np.asarray(found.state.theta2)], axis=1)
-        assert float(np.max(np.abs(ours - exact[:, :2]))) < found.error_estimate < 1e-3
+        assert float(np.max(np.abs(ours - exact[:, :2]))) < found.error_estimate < 2e-3
 
 
 @pytest.mark.slow
