@@ -20,6 +20,7 @@ from dpend.inverse.design import design_pendulum as design_pendulum
 from dpend.inverse.fit import Fit as Fit
 from dpend.inverse.fit import fit_parameters as fit_parameters
 from dpend.inverse.measurements import load_angles as load_angles
+from dpend.maps.store import StoreWarning as StoreWarning
 from dpend.maps.sweep import sweep as sweep
 from dpend.mechanics.pendulum import BobEnergies as BobEnergies
 from dpend.mechanics.pendulum import Equilibria as Equilibria

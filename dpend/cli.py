@@ -254,7 +254,9 @@ def atlas(
         if store is not None and out.resolve() == store.resolve():
             raise ValueError(f"out must be another file than store, got {out} for both: give another name")
     pendulum = Pendulum(l1, l2, m1, m2, g)
-    _tell_cost(swinging_pendulum(pendulum), max_period, theta1, most_steps)
+    steps = _steps_of_search(swinging_pendulum(pendulum), max_period, theta1)
+    if steps <= most_steps:
+        _tell_cost(steps, steps * SECONDS_PER_STEP)
     with _work("slices" if theta1 is None else "million steps") as show:
         if theta1 is not None:
             found = dpend.find_brake_orbits(
@@ -287,15 +289,18 @@ def atlas(
 _LONG, _LARGE = 60.0, 1e9
 
 
-def _tell_cost(pendulum: Pendulum, max_period: float, theta1: float | None, most_steps: float) -> None:
+def _tell_cost(steps: float, seconds: float, size: float = 0.0, more: str = "") -> None:
+    """Says before it begins what takes more than a minute, or more than a gigabyte of `size` [bytes]."""
+    if seconds > _LONG or size > _LARGE:
+        room = f" and {size / 1e9:.2g} GB" if size > _LARGE else ""
+        _complain(f"about {steps:.1e} time steps, which may take {math.ceil(seconds / 60)} minutes{room}{more}")
+
+
+def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None) -> float:
     known_period(pendulum, max_period)
     if theta1 is None:
-        steps = survey.expected_steps(pendulum, max_period)
-    else:
-        steps = expected_steps(pendulum, max_period, _radians("theta1", theta1))
-    if steps <= most_steps and steps * SECONDS_PER_STEP > _LONG:
-        minutes = math.ceil(steps * SECONDS_PER_STEP / 60)
-        print(f"dpend: this takes about {steps:.1g} time steps, some {minutes} minutes", file=sys.stderr)
+        return survey.expected_steps(pendulum, max_period)
+    return expected_steps(pendulum, max_period, _radians("theta1", theta1))
 
 
 # Seconds between two lines about a search whose standard error is no terminal.
@@ -396,10 +401,8 @@ def simulate(
     pendulum = Pendulum(l1, l2, m1, m2, g)
     state = State(_radians("theta1", theta1), _radians("theta2", theta2), number("p1", p1), number("p2", p2))
     write = writer(out) if out is not None else None
-    if step is not None and step > 0 and MOST_MOTION_STEPS < abs(duration / step) <= most_steps:
-        seconds = abs(duration / step) / _STEPS_A_SECOND
-        _complain(f"{abs(duration / step):,.0f} steps take some {seconds / 60:.0f} minutes and "
-                  f"{_BYTES_A_STEP * seconds * _STEPS_A_SECOND / 1e9:.0f} GB")  # fmt: skip
+    if step is not None and step > 0 and (steps := abs(duration / step)) <= most_steps:
+        _tell_cost(steps, steps / _STEPS_A_SECOND, steps * _BYTES_A_STEP)
     with _clock("integrating"):
         motion = dpend.simulate(
             pendulum, state, duration, step=step, method=method, tolerance=tolerance, most_steps=most_steps
@@ -652,11 +655,8 @@ _MOST_CELLS = 65536
 
 
 def _announce(cost: Cost) -> None:
-    if cost.seconds > _LONG or cost.bytes > _LARGE:
-        _complain(
-            f"{cost.cells} cells to compute, about {cost.steps:.1e} steps, which may take {cost.seconds / 60:.0f} "
-            f"minutes, and values of {cost.bytes / 1e9:.2g} GB; stopped and started again, it goes on"
-        )
+    more = f", for {cost.cells} cells; stopped and started again, it goes on"
+    _tell_cost(cost.steps, cost.seconds, cost.bytes, more)
 
 
 @contextlib.contextmanager

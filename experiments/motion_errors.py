@@ -12,8 +12,10 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import NamedTuple
 
+import extended
 import heyoka
 import jax
 import numpy as np
@@ -65,15 +67,10 @@ def of_other_pendulums(random: np.random.Generator) -> Iterator[Motion]:
 
 def integrator() -> heyoka.taylor_adaptive:
     """Lagrange's equations in long double; the pendulum's fields are its parameters."""
-    theta1, theta2, omega1, omega2 = heyoka.make_vars("theta1", "theta2", "omega1", "omega2")
-    l1, l2, m1, m2, g = (heyoka.par[i] for i in range(5))
-    s, c = heyoka.sin(theta1 - theta2), heyoka.cos(theta1 - theta2)
-    right1 = -m2 * l2 * s * omega2**2 - (m1 + m2) * g * heyoka.sin(theta1)
-    right2 = l1 * s * omega1**2 - g * heyoka.sin(theta2)
-    size = m1 + m2 * s * s
-    a1 = (right1 - m2 * c * right2) / (l1 * size)
-    a2 = ((m1 + m2) * right2 - c * right1) / (l2 * size)
-    equations = [(theta1, omega1), (theta2, omega2), (omega1, a1), (omega2, a2)]
+    state = heyoka.make_vars("theta1", "theta2", "omega1", "omega2")
+    numpy = SimpleNamespace(sin=heyoka.sin, cos=heyoka.cos, stack=list)
+    slopes = extended.accelerations([heyoka.par[i] for i in range(5)], state, numpy)
+    equations = list(zip(state, slopes, strict=True))
     zero = np.longdouble(0)
     return heyoka.taylor_adaptive(equations, [zero] * 4, fp_type=np.longdouble, pars=[zero] * 5)
 

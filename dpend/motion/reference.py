@@ -18,7 +18,7 @@ from dpend.motion.integrate import float64
 from dpend.motion.simulate import Trajectory, energy_drift
 from dpend.status import Status
 
-# The same of `reference`, whose steps take 20 microseconds: half a minute.
+# Steps, if nobody asks for more: at 20 microseconds each they take half a minute, as the most steps of `simulate` do.
 _MOST_ADAPTIVE_STEPS = 1_000_000
 
 # The change at ten times the tolerance is some eight times the error, but in two of a hundred random motions less, at

@@ -90,6 +90,7 @@ class Trajectory:
         attributes = {
             "energy_drift": float(self.energy_drift),
             "error_estimate_rad": float(self.error_estimate),
+            "tolerance_rad": float(self.tolerance),
             "steps": int(self.steps),
             "method": self.scheme.name if self.scheme else "diffrax Dopri8",
             "status": Status(int(self.status)).name.lower(),
