@@ -133,7 +133,7 @@ def main() -> None:
         passed = [v for v in verdicts if v.passed]
         fails |= any(v.error > 2 * v.tolerance for v in passed)
         fails |= sum(v.error > v.tolerance for v in passed) > len(passed) / 200
-    sys.exit(fails)
+    sys.exit(bool(fails))
 
 
 if __name__ == "__main__":

@@ -132,11 +132,15 @@ def test_the_table_of_speeds_is_made_of_the_measured_rows():
 @pytest.mark.slow
 @pytest.mark.parametrize("script", sorted(set(SCRIPTS)))
 def test_every_experiment_runs(tmp_path, script):
-    """In a copy, as what they write lies beside them."""
+    """In a copy, as what they write lies beside them. No row of the hard cases fails but the one whose page says so."""
     place = tmp_path / "experiments"
     shutil.copytree(HOUSE / "experiments", place, ignore=shutil.ignore_patterns("__pycache__", "paper"))
     shutil.copy(README, tmp_path)
+    if re.search(r"^import heyoka", (place / script).read_text(), re.MULTILINE):
+        pytest.importorskip("heyoka")
     command = [sys.executable, place / script, "--quick"]
     environment = {"PYTHONPATH": str(HOUSE), "MPLBACKEND": "Agg"}
     done = subprocess.run(command, cwd=tmp_path, env={**os.environ, **environment}, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    failed = re.findall(r"^ *\d+  fails .*$", done.stdout, re.MULTILINE)
+    assert all("gauss" in row and "trend of the energy" in row for row in failed), failed
+    assert done.returncode == bool(failed), done.stderr
