@@ -289,14 +289,14 @@ def atlas(
 _LONG, _LARGE = 60.0, 1e9
 
 
-def _tell_cost(steps: float, seconds: float, size: float = 0.0, more: str = "") -> None:
+def _tell_cost(steps: int | float, seconds: float, size: int | float = 0, more: str = "") -> None:
     """Says before it begins what takes more than a minute, or more than a gigabyte of `size` [bytes]."""
     if seconds > _LONG or size > _LARGE:
         room = f" and {size / 1e9:.2g} GB" if size > _LARGE else ""
         _complain(f"about {steps:.1e} time steps, which may take {math.ceil(seconds / 60)} minutes{room}{more}")
 
 
-def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None) -> float:
+def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None) -> int | float:
     known_period(pendulum, max_period)
     if theta1 is None:
         return survey.expected_steps(pendulum, max_period)
