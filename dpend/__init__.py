@@ -1,6 +1,7 @@
 """A differentiable double pendulum, and the motions released from rest that come back.
 
-Angles in radians, SI units. The public names are those below; each module's page says what it computes and how.
+Angles in radians, SI units. The public names are those below; each module's page says what it
+computes and how.
 """
 
 import importlib

@@ -1,12 +1,14 @@
-"""How JAX is set up when dpend is imported: float64, one CPU device a core, and XLA options that make time loops fast.
+"""How JAX is set up when dpend is imported: float64, one CPU device a core, and XLA options that
+make time loops fast.
 
-This is the package's one effect at import, and it happens only while JAX has not started a backend. With
-`DPEND_PLAIN_JAX=1` in the environment nothing is touched: everything works, more slowly, and float64 is then the
-caller's to switch on.
+This is the package's one effect at import, and it happens only while JAX has not started a backend.
+With `DPEND_PLAIN_JAX=1` in the environment nothing is touched: everything works, more slowly, and
+float64 is then the caller's to switch on.
 
-The options are undocumented, and XLA ends the process over a flag it does not know, so each name is looked up in the
-installed jaxlib first. What they are worth was measured: one order-8 trajectory with tangents runs six times as fast.
-The user's own `XLA_FLAGS` are tried in a process of their own first, which takes 0.2 s where there are any.
+The options are undocumented, and XLA ends the process over a flag it does not know, so each name is
+looked up in the installed jaxlib first. What they are worth was measured: one order-8 trajectory
+with tangents runs six times as fast. The user's own `XLA_FLAGS` are tried in a process of their own
+first, which takes 0.2 s where there are any.
 """
 
 import contextlib
@@ -33,7 +35,8 @@ def _is_program() -> bool:
 def leave_quietly() -> None:
     """Has Ctrl-C end the process at once with status 130, and what is not caught be one line.
 
-    The program uses it while it imports and while it ends: there is nothing to save then, and no one to catch it.
+    The program uses it while it imports and while it ends: there is nothing to save then, and no
+    one to catch it.
     """
     _on_interrupt(signal.default_int_handler, _leave)
     sys.excepthook = _tell_in_one_line
@@ -46,8 +49,12 @@ def catch_interrupts() -> None:
 
 
 def _on_interrupt(before: Callable[..., object], after: Callable[..., object]) -> None:
-    # A handler of somebody else stays: a shell, say, has what it starts in the background ignore Ctrl-C.
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is before:
+    # A handler of somebody else stays: a shell, say, has what it starts in the background ignore
+    # Ctrl-C.
+    if (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is before
+    ):
         signal.signal(signal.SIGINT, after)
 
 
@@ -55,7 +62,9 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(130)
 
 
-def _tell_in_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def _tell_in_one_line(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
     if issubclass(kind, (RuntimeError, ValueError, OSError)):
         sys.stderr.write("dpend: " + " ".join(str(error).split()) + "\n")
     else:
@@ -70,19 +79,26 @@ import jaxlib  # noqa: E402
 
 PLAIN = "DPEND_PLAIN_JAX"
 
-# A step has several outputs; by default XLA fuses the step once for each and computes its stages again in every one.
+# A step has several outputs; by default XLA fuses the step once for each and computes its stages
+# again in every one.
 _SHARE_OUTPUTS = ("xla_cpu_use_multi_output_fusion", "true")
-# Loops whose state is below this many bytes become one kernel, without a dispatch for each operation of each turn.
+# Loops whose state is below this many bytes become one kernel, without a dispatch for each
+# operation of each turn.
 _LOOP_IN_ONE_KERNEL = ("xla_cpu_small_while_loop_byte_threshold", "1000000")
 # XLA stays at 256 bits even where the processor has 512.
 _VECTOR_WIDTH = ("xla_cpu_prefer_vector_width", "512")
 
 
 def _known_to_xla(*names: str) -> bool:
-    """Whether the installed XLA mentions every one of `names` (a search of its shared library, a few milliseconds)."""
+    """Whether the installed XLA mentions every one of `names` (a search of its shared library, a
+    few milliseconds).
+    """
     library = Path(jaxlib.__file__).parent / "libjax_common.so"
     try:
-        with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+        with (
+            library.open("rb") as file,
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text,
+        ):
             return all(text.find(name.encode()) >= 0 for name in names)
     except (OSError, ValueError):
         return False
@@ -96,7 +112,9 @@ def _has_avx512() -> bool:
 
 
 def _extended_flags(flags: str) -> str:
-    """`flags` (the user's `XLA_FLAGS`) with our options added where the user has not spoken of them."""
+    """`flags` (the user's `XLA_FLAGS`) with our options added where the user has not spoken of
+    them.
+    """
 
     def spoken_of(name: str) -> bool:
         return re.search(rf"\b{name}\b", flags) is not None
@@ -107,12 +125,17 @@ def _extended_flags(flags: str) -> str:
         added.append(f"--{name}={width}")
     extra = [option for option in (_SHARE_OUTPUTS, _LOOP_IN_ONE_KERNEL) if not spoken_of(option[0])]
     if extra and _known_to_xla("xla_backend_extra_options", *(name for name, _ in extra)):
-        added.append("--xla_backend_extra_options=" + ",".join(f"{name}={value}" for name, value in extra))
+        added.append(
+            "--xla_backend_extra_options=" + ",".join(f"{name}={value}" for name, value in extra)
+        )
     return " ".join([flags, *added]).strip()
 
 
 # What has XLA parse its flags, once in a process; no backend starts for that.
-_PARSE = "from jaxlib.xla_client import CompileOptions; CompileOptions().executable_build_options.debug_options"
+_PARSE = (
+    "from jaxlib.xla_client import CompileOptions; "
+    "CompileOptions().executable_build_options.debug_options"
+)
 # It takes 0.2 s; on a machine that is this busy the flags go untried.
 _PATIENCE = 60.0
 
@@ -120,19 +143,29 @@ _PATIENCE = 60.0
 def _check_flags() -> None:
     """Refuses the user's `XLA_FLAGS` where the installed XLA would end the process over them.
 
-    XLA itself is asked, in a process of its own: it alone knows its flags, and which values they take.
+    XLA itself is asked, in a process of its own: it alone knows its flags, and which values they
+    take.
 
     Raises:
-        RuntimeError: a flag that it does not know, a value that it cannot read, or a file of flags that is not there.
+        RuntimeError: a flag that it does not know, a value that it cannot read, or a file of flags
+            that is not there.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if not flags.strip() or not sys.executable:
         return
     paths = os.pathsep.join(path for path in sys.path if path)
-    command, environment = [sys.executable, "-c", _PARSE], {**os.environ, "PYTHONPATH": paths, "PYTHONWARNINGS": ""}
+    command, environment = (
+        [sys.executable, "-c", _PARSE],
+        {**os.environ, "PYTHONPATH": paths, "PYTHONWARNINGS": ""},
+    )
     try:
         asked = subprocess.run(
-            command, env=environment, capture_output=True, text=True, errors="replace", timeout=_PATIENCE
+            command,
+            env=environment,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_PATIENCE,
         )
     except (OSError, subprocess.SubprocessError):
         return
@@ -141,21 +174,28 @@ def _check_flags() -> None:
         unknown = re.search(r"Unknown flags? in XLA_FLAGS: (.*)", said[1])
         wrong = unknown[1].strip() if unknown else flags.strip()
         raise RuntimeError(
-            f"XLA_FLAGS must hold flags and values that the installed XLA knows, got {wrong!r:.200}: "
+            f"XLA_FLAGS must hold flags and values that the installed XLA knows, got "
+            f"{wrong!r:.200}: "
             "take them out of the environment"
         )
 
 
 def _add_compile_options() -> None:
-    """Has XLA parse its options with ours among them, then restores `XLA_FLAGS`, which child processes inherit."""
+    """Has XLA parse its options with ours among them, then restores `XLA_FLAGS`, which child
+    processes inherit.
+    """
     before = os.environ.get("XLA_FLAGS")
     os.environ["XLA_FLAGS"] = _extended_flags(before or "")
     try:
-        # XLA parses the variable once, at the first compile options made in the process; no backend starts for that.
+        # XLA parses the variable once, at the first compile options made in the process; no backend
+        # starts for that.
         from jaxlib.xla_client import CompileOptions
 
         _ = CompileOptions().executable_build_options.debug_options
-    except (ImportError, AttributeError):  # another jaxlib: it parses when the backend starts, so the variable stays
+    except (
+        ImportError,
+        AttributeError,
+    ):  # another jaxlib: it parses when the backend starts, so the variable stays
         return
     if before is None:
         del os.environ["XLA_FLAGS"]
@@ -168,7 +208,8 @@ def _cores() -> int:
 
 
 def configure() -> None:
-    """Sets JAX up for this package, unless it runs already or `DPEND_PLAIN_JAX=1` asks to leave it alone.
+    """Sets JAX up for this package, unless it runs already or `DPEND_PLAIN_JAX=1` asks to leave it
+    alone.
 
     Raises:
         RuntimeError: `XLA_FLAGS` that XLA would end the process over.
@@ -179,10 +220,14 @@ def configure() -> None:
     forced = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     wanted = _cores() if devices < 0 and not forced else devices
     try:
-        jax.config.update("jax_num_cpu_devices", wanted)  # refused once a backend runs: the public test for that
+        jax.config.update(
+            "jax_num_cpu_devices", wanted
+        )  # refused once a backend runs: the public test for that
     except RuntimeError:
         return
-    if "JAX_ENABLE_X64" not in os.environ:  # the user's own word stands; `require_float64` then says what is missing
+    if (
+        "JAX_ENABLE_X64" not in os.environ
+    ):  # the user's own word stands; `require_float64` then says what is missing
         jax.config.update("jax_enable_x64", True)
     _check_flags()
     with contextlib.suppress(OSError):
@@ -197,7 +242,8 @@ def require_float64() -> None:
     """
     if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise RuntimeError(
-            "float64 is off in JAX, and dpend's digits need it: import dpend before JAX runs anything, "
+            "float64 is off in JAX, and dpend's digits need it: import dpend before JAX runs "
+            "anything, "
             'or call jax.config.update("jax_enable_x64", True), or set JAX_ENABLE_X64=1'
         )
 

@@ -1,6 +1,8 @@
-"""Motions as moving pictures: GIF by Pillow, MP4 by the encoder of imageio-ffmpeg, PNG as a stroboscope sees it.
+"""Motions as moving pictures: GIF by Pillow, MP4 by the encoder of imageio-ffmpeg, PNG as a
+stroboscope sees it.
 
-Several releases are drawn into one picture, each in a colour of its own, so that one sees when they part.
+Several releases are drawn into one picture, each in a colour of its own, so that one sees when they
+part.
 """
 
 import math
@@ -28,12 +30,14 @@ from dpend.records import replacing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, told apart by the colour-blind; its yellow is too pale for a line on white.
+# Okabe and Ito's palette, told apart by the colour-blind; its yellow is too pale for a line on
+# white.
 COLOURS = (UPPER, LOWER, "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-# GIFs tell time in hundredths of a second, and 25 a second is the fastest rate in whole ones that players keep.
+# GIFs tell time in hundredths of a second, and 25 a second is the fastest rate in whole ones that
+# players keep.
 FRAMES_PER_SECOND = 25
-# In one step the fast mode advances by this [rad]: order 8 is then right far below a pixel, for as long as the motion
-# can be known at all, and all releases share one compiled program.
+# In one step the fast mode advances by this [rad]: order 8 is then right far below a pixel, for as
+# long as the motion can be known at all, and all releases share one compiled program.
 _TURN = 0.05
 # Saved times in a frame: the trail is then a curve, not a polygon.
 _SAVED = 4
@@ -47,7 +51,11 @@ _MOST_STEPS = 10_000_000
 
 
 def motions_for(
-    pendulum: Pendulum | Any, releases: Sequence[State] | Any, duration: float | Any, *, speed: float | Any = 1.0
+    pendulum: Pendulum | Any,
+    releases: Sequence[State] | Any,
+    duration: float | Any,
+    *,
+    speed: float | Any = 1.0,
 ) -> list[Trajectory]:
     """The motions from `releases`, saved four times a frame.
 
@@ -57,11 +65,13 @@ def motions_for(
     Returns:
         Trajectories with equal times. Their status says whether their end may be believed.
     Raises:
-        ValueError: duration or speed not positive; a speed at which the motion does not last for a frame; more than
-            10 000 frames, or 1e7 steps; rates that overflow.
+        ValueError: duration or speed not positive; a speed at which the motion does not last for a
+            frame; more than 10 000 frames, or 1e7 steps; rates that overflow.
     """
     if not isinstance(releases, Sequence) or isinstance(releases, (str, bytes)):
-        raise ValueError(f"releases must be a sequence of states, got {shown(releases)}: give one like [state]")
+        raise ValueError(
+            f"releases must be a sequence of states, got {shown(releases)}: give one like [state]"
+        )
     for release in releases:
         check_state(release, "releases")
         check_motion(pendulum, release)
@@ -69,24 +79,32 @@ def motions_for(
     interval = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
     duration = known_number("duration", duration, positive=True, unit="s")
     if not interval <= duration:
-        raise ValueError(f"speed must show the motion of {duration:g} s for a frame at least, got {speed:g}: lower it")
+        raise ValueError(
+            f"speed must show the motion of {duration:g} s for a frame at least, got {speed:g}: "
+            f"lower it"
+        )
     count = duration / interval if interval > 0 else math.inf
     if count > _MOST_FRAMES:
         raise ValueError(
-            f"duration must give at most {_MOST_FRAMES} frames, got {count:.3g}: give a shorter one, or a higher speed"
+            f"duration must give at most {_MOST_FRAMES} frames, got {count:.3g}: give a shorter "
+            f"one, or a higher speed"
         )
     frames = math.ceil(count - 1e-9)
     substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
     steps = frames * _SAVED * (substeps + 1)
     if not steps <= _MOST_STEPS:
         raise ValueError(
-            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got {duration:g} s, which takes "
+            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got "
+            f"{duration:g} s, which takes "
             f"{steps:.3g}: give a shorter one, or another pendulum"
         )
     every = max(1, math.ceil(substeps))
     step = interval / (_SAVED * every)
     end, most = frames * interval, 2 * _MOST_STEPS
-    return [simulate(pendulum, one, end, step=step, save_every=every, most_steps=most) for one in releases]
+    return [
+        simulate(pendulum, one, end, step=step, save_every=every, most_steps=most)
+        for one in releases
+    ]
 
 
 def film(
@@ -98,7 +116,8 @@ def film(
 ) -> int:
     """Draws motions with common, equally spaced times into `out`; returns the number of frames.
 
-    A .gif or .mp4 shows every fourth saved time, 25 in a second; a .png all of these at once, fading into the past.
+    A .gif or .mp4 shows every fourth saved time, 25 in a second; a .png all of these at once,
+    fading into the past.
 
     Arguments:
         progress: told after each frame how many are drawn, and of how many.
@@ -110,15 +129,22 @@ def film(
     check_out(out)
     check_pendulum(pendulum)
     if not isinstance(motions, Sequence):
-        raise ValueError(f"motions must be a sequence of trajectories, got {shown(motions)}: see motions_for")
+        raise ValueError(
+            f"motions must be a sequence of trajectories, got {shown(motions)}: see motions_for"
+        )
     for motion in motions:
         instance("motions", motion, Trajectory, "a list of them, see motions_for")
     if progress is not None:
         function("progress", progress, "(frames done, frames in all)", "print")
     if not motions or not all(np.array_equal(motion.time, motions[0].time) for motion in motions):
-        raise ValueError(f"motions must be at least one, saved at the same times, got {len(motions)}: see motions_for")
+        raise ValueError(
+            f"motions must be at least one, saved at the same times, got {len(motions)}: see "
+            f"motions_for"
+        )
     with replacing(out) as draft:
-        return _WRITERS[out.suffix](pendulum, motions, draft, progress or (lambda done, total: None))
+        return _WRITERS[out.suffix](
+            pendulum, motions, draft, progress or (lambda done, total: None)
+        )
 
 
 def check_out(out: Path | Any) -> None:
@@ -205,10 +231,15 @@ def _write_gif(pendulum, motions, path, progress):  # type: ignore[no-untyped-de
 
 def _write_mp4(pendulum, motions, path, progress):  # type: ignore[no-untyped-def]
     total = _count(motions)
-    writer = _encoder().write_frames(str(path), (_PIXELS, _PIXELS), fps=FRAMES_PER_SECOND, macro_block_size=16)
+    writer = _encoder().write_frames(
+        str(path), (_PIXELS, _PIXELS), fps=FRAMES_PER_SECOND, macro_block_size=16
+    )
     with warnings.catch_warnings():
-        # The encoder is started by a fork that becomes another program at once: no thread of JAX is missed.
-        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+        # The encoder is started by a fork that becomes another program at once: no thread of JAX is
+        # missed.
+        warnings.filterwarnings(
+            "ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning
+        )
         writer.send(None)
     for done, frame in enumerate(_frames(pendulum, motions), 1):
         writer.send(np.ascontiguousarray(frame))

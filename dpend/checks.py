@@ -30,7 +30,11 @@ _SHORTENED.maxstring = _SHORTENED.maxother = _LONGEST
 def shown(value: Any) -> str:
     """A value as errors show it: short, on one line, whatever it is."""
     if isinstance(value, (float, np.generic, np.ndarray, jax.Array)) and not is_traced(value):
-        text = np.array2string(np.asarray(value), threshold=6, edgeitems=2) if np.ndim(value) else str(value)
+        text = (
+            np.array2string(np.asarray(value), threshold=6, edgeitems=2)
+            if np.ndim(value)
+            else str(value)
+        )
     else:
         try:
             text = _SHORTENED.repr(value)
@@ -46,12 +50,16 @@ def is_traced(value: Any) -> bool:
 
 
 def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
-    """A number as float64, NaN and infinity as they are; an array, also a traced one, as an array of float64.
+    """A number as float64, NaN and infinity as they are; an array, also a traced one, as an array
+    of float64.
 
     Raises:
-        ValueError: anything else: text, complex numbers, booleans, None, lists, integers beyond the range of float64.
+        ValueError: anything else: text, complex numbers, booleans, None, lists, integers beyond the
+            range of float64.
     """
-    if isinstance(value, float):  # the usual one, NumPy's float64 among them, without a look at anything else
+    if isinstance(
+        value, float
+    ):  # the usual one, NumPy's float64 among them, without a look at anything else
         return np.float64(value)
     if isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.timedelta64)):
         known: float | None
@@ -62,7 +70,9 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
         if known is None or (math.isinf(known) and value != known):
             raise ValueError(f"{name} must be {wanted}, got {shown(value)}: give one below 1.8e308")
         return np.float64(known)
-    if not isinstance(value, (np.ndarray, jax.Array, jax.ShapeDtypeStruct)) and hasattr(value, "__array__"):
+    if not isinstance(value, (np.ndarray, jax.Array, jax.ShapeDtypeStruct)) and hasattr(
+        value, "__array__"
+    ):
         value = np.asarray(value)  # of another library
     kind = getattr(value, "dtype", None)
     if kind is None or not (jnp.issubdtype(kind, np.floating) or np.dtype(kind).kind in "iu"):
@@ -78,15 +88,19 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
 def number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> Any:
     """A finite number as float64; an array, also a traced one, as an array of float64.
 
-    Single numbers are looked at wherever they are known, and what has to be positive in arrays too. In an array of many
-    a NaN may stand for what is not known.
+    Single numbers are looked at wherever they are known, and what has to be positive in arrays too.
+    In an array of many a NaN may stand for what is not known.
 
     Raises:
         ValueError: as `real`; NaN or an infinity; with `positive` what is not above zero.
     """
     wanted = f"a finite {'positive ' if positive else ''}number" + (f" [{unit}]" if unit else "")
     value = real(name, value, wanted=wanted)
-    if isinstance(value, jax.ShapeDtypeStruct) or is_traced(value) or not (positive or value.ndim == 0):
+    if (
+        isinstance(value, jax.ShapeDtypeStruct)
+        or is_traced(value)
+        or not (positive or value.ndim == 0)
+    ):
         return value
     if value.ndim:
         wrong = bool(np.any(np.asarray(value) <= 0))
@@ -98,7 +112,8 @@ def number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> 
 
 
 def coordinate(name: str, value: Any, *, unit: str) -> Any:
-    """A coordinate of a state as float64: a finite number, or an array that JAX has computed, which may hold a NaN.
+    """A coordinate of a state as float64: a finite number, or an array that JAX has computed, which
+    may hold a NaN.
 
     Where a motion was lost its end is NaN, and what goes on from there says so by its status.
 
@@ -115,7 +130,9 @@ def single(name: str, value: Any) -> None:
         ValueError: the value has a shape.
     """
     if np.ndim(value):
-        raise ValueError(f"{name} must be a scalar, got shape {np.shape(value)}: map over many with jax.vmap")
+        raise ValueError(
+            f"{name} must be a scalar, got shape {np.shape(value)}: map over many with jax.vmap"
+        )
 
 
 def one_shape(**values: Any) -> None:
@@ -131,7 +148,9 @@ def one_shape(**values: Any) -> None:
         np.broadcast_shapes(*shapes)
     except ValueError:
         names, each = ", ".join(values), ", ".join(map(str, shapes))
-        raise ValueError(f"{names} must have one shape, got {each}: give numbers or arrays of one shape") from None
+        raise ValueError(
+            f"{names} must have one shape, got {each}: give numbers or arrays of one shape"
+        ) from None
 
 
 def known_value(value: Any) -> float | None:
@@ -154,13 +173,15 @@ def known_real(name: str, value: Any, *, unit: str = "") -> float:
     single(name, value)
     if is_traced(value):
         raise ValueError(
-            f"{name} must be a number here, not traced by jit or a derivative, got {shown(value)}: give a number"
+            f"{name} must be a number here, not traced by jit or a derivative, got {shown(value)}: "
+            f"give a number"
         )
     return float(value)
 
 
 def known_number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> float:
-    """The finite number of an argument that decides what is computed, and that no derivative goes through.
+    """The finite number of an argument that decides what is computed, and that no derivative goes
+    through.
 
     Raises:
         ValueError: as `number`; an array, or a value traced by `jit` or a derivative.
@@ -180,7 +201,9 @@ def integer(name: str, value: Any, *, least: int = 1) -> int:
     whole = _is_whole(value)
     if not whole or not least <= value <= _LARGEST_INTEGER:
         span = f"of at least {least}" + (" and at most 2^53" if whole and value > least else "")
-        raise ValueError(f"{name} must be an integer {span}, got {shown(given)}: give one like {least}")
+        raise ValueError(
+            f"{name} must be an integer {span}, got {shown(given)}: give one like {least}"
+        )
     return int(value)
 
 
@@ -190,16 +213,20 @@ def _is_whole(value: Any) -> bool:
 
 
 def numbers(name: str, values: Any, *, unit: str = "", gaps: bool = False) -> np.ndarray:
-    """An array of known numbers as float64, of any shape; NaN passes. With `gaps` None does too, and becomes NaN.
+    """An array of known numbers as float64, of any shape; NaN passes. With `gaps` None does too,
+    and becomes NaN.
 
     Raises:
-        ValueError: text, complex numbers, booleans or dates among them; rows of different lengths; a traced array.
+        ValueError: text, complex numbers, booleans or dates among them; rows of different lengths;
+            a traced array.
     """
     wanted = "numbers" + (f" [{unit}]" if unit else "")
     try:
         array = np.asarray(values)
         if array.dtype == object:  # integers beyond 64 bits, fractions, gaps
-            cells = [np.nan if gaps and cell is None else real(name, cell) for cell in array.ravel()]
+            cells = [
+                np.nan if gaps and cell is None else real(name, cell) for cell in array.ravel()
+            ]
             array = np.array(cells, np.float64).reshape(array.shape)
     except (TypeError, ValueError):
         array = np.empty(0, object)
@@ -209,7 +236,8 @@ def numbers(name: str, values: Any, *, unit: str = "", gaps: bool = False) -> np
 
 
 def arrays(name: str, tree: Any) -> None:
-    """Refuses a tree of which a leaf is no number and no array of numbers; complex numbers and booleans are.
+    """Refuses a tree of which a leaf is no number and no array of numbers; complex numbers and
+    booleans are.
 
     Raises:
         ValueError: text, objects, or integers beyond the range of float64 among its leaves.
@@ -218,8 +246,13 @@ def arrays(name: str, tree: Any) -> None:
         kind = getattr(leaf, "dtype", None)
         if kind is None and isinstance(leaf, Number) and not isinstance(leaf, (complex, bool)):
             real(name, leaf)
-        elif not (isinstance(leaf, Number) or (kind is not None and np.dtype(kind).kind not in "OSUMm")):
-            raise ValueError(f"{name} must be a tree of numbers and arrays, got {shown(leaf)} in it: give numbers")
+        elif not (
+            isinstance(leaf, Number) or (kind is not None and np.dtype(kind).kind not in "OSUMm")
+        ):
+            raise ValueError(
+                f"{name} must be a tree of numbers and arrays, got {shown(leaf)} in it: give "
+                f"numbers"
+            )
 
 
 def flag(name: str, value: Any) -> bool:
@@ -259,7 +292,9 @@ def at_most_one(**given: Any) -> None:
     names = [name for name, value in given.items() if value is not None]
     if len(names) > 1:
         values = " and ".join(shown(given[name]) for name in names)
-        raise ValueError(f"{' and '.join(names)} exclude each other, got {values}: give one of them")
+        raise ValueError(
+            f"{' and '.join(names)} exclude each other, got {values}: give one of them"
+        )
 
 
 def text(name: str, value: Any) -> str:
@@ -277,7 +312,8 @@ def several(name: str, value: Any, form: str, count: int) -> tuple[Any, ...]:
     """So many values in order: a tuple, a list or an array, also a traced one.
 
     Raises:
-        ValueError: another number of them, or something without an order; `form` shows what is meant.
+        ValueError: another number of them, or something without an order; `form` shows what is
+            meant.
     """
     if isinstance(value, (np.ndarray, jax.Array)):
         ordered = value.ndim > 0
@@ -297,7 +333,9 @@ def instance(name: str, value: Any, kind: type, fix: str) -> None:
     """
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise ValueError(f"{name} must be {article} {kind.__name__}, got {shown(value)}: give {fix}")
+        raise ValueError(
+            f"{name} must be {article} {kind.__name__}, got {shown(value)}: give {fix}"
+        )
 
 
 def function(name: str, value: Any, of: str, like: str) -> None:
@@ -307,7 +345,9 @@ def function(name: str, value: Any, of: str, like: str) -> None:
         ValueError: no function.
     """
     if not callable(value):
-        raise ValueError(f"{name} must be a function of {of}, got {shown(value)}: give one like {like}")
+        raise ValueError(
+            f"{name} must be a function of {of}, got {shown(value)}: give one like {like}"
+        )
 
 
 def file_path(name: str, value: Any) -> Path:
@@ -325,11 +365,13 @@ def file_path(name: str, value: Any) -> Path:
 def unwritable(path: Path) -> str:
     """Why no new file can be put beside `path`, in the system's words; empty if one can.
 
-    It is tried: permissions do not tell what the root user, a disk mounted for reading or the system's own directories
-    allow, nor how long a name may be.
+    It is tried: permissions do not tell what the root user, a disk mounted for reading or the
+    system's own directories allow, nor how long a name may be.
     """
     try:
-        tempfile.NamedTemporaryFile(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent).close()
+        tempfile.NamedTemporaryFile(
+            prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent
+        ).close()
     except OSError as error:
         return error.strerror or str(error)
     return ""
@@ -342,13 +384,17 @@ def check_place(name: str, path: Path, suffixes: Sequence[str]) -> None:
         ValueError: another suffix; no directory to write in. `name` is the argument that is told.
     """
     if path.suffix not in suffixes:
-        raise ValueError(f"{name} must end in {' or '.join(suffixes)}, got {path}: give another name")
+        raise ValueError(
+            f"{name} must end in {' or '.join(suffixes)}, got {path}: give another name"
+        )
     reason = "Is a directory" if os.path.isdir(path) else unwritable(path)
     if reason:
         raise ValueError(
-            f"{name} must be a file in a directory that can be written to, got {path} ({reason}): give another place"
+            f"{name} must be a file in a directory that can be written to, got {path} ({reason}): "
+            f"give another place"
         )
 
 
-# A float64 scalar, or an array where a class holds many at once; transformations also pass tracers and placeholders.
+# A float64 scalar, or an array where a class holds many at once; transformations also pass tracers
+# and placeholders.
 Scalar: TypeAlias = Any

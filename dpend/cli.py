@@ -1,7 +1,8 @@
-"""The command line: the only module that prints. Angles are in degrees here, and nowhere else but in CSV and JSON.
+"""The command line: the only module that prints. Angles are in degrees here, and nowhere else but
+in CSV and JSON.
 
-Exit status 0: done. 1: ran, but some solve failed, or the environment is wrong. 2: bad input, one line on standard
-error. 130: interrupted. 141: nobody reads standard output any more.
+Exit status 0: done. 1: ran, but some solve failed, or the environment is wrong. 2: bad input, one
+line on standard error. 130: interrupted. 141: nobody reads standard output any more.
 """
 
 import contextlib
@@ -59,7 +60,9 @@ from dpend.status import Status
 
 
 class _Command(typer.core.TyperCommand):
-    """A command that refuses what no option can mean: one given twice, an empty text, a number that is not finite."""
+    """A command that refuses what no option can mean: one given twice, an empty text, a number that
+    is not finite.
+    """
 
     # Any: each version of typer has its own class of contexts.
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -67,16 +70,22 @@ class _Command(typer.core.TyperCommand):
         for option in self.params:
             name, times = max(option.opts, key=len), sum(option is one for one in order)
             if times > 1 and not option.multiple and option.nargs == 1:
-                raise ValueError(f"{name} must be given once at most, got it {times} times: leave out all but one")
+                raise ValueError(
+                    f"{name} must be given once at most, got it {times} times: leave out all but "
+                    f"one"
+                )
             if "" in _several(given.get(option.name or "")):
-                raise ValueError(f"{name} must not be empty, got '': give a value, or leave {name} out")
+                raise ValueError(
+                    f"{name} must not be empty, got '': give a value, or leave {name} out"
+                )
         rest = super().parse_args(ctx, args)
         for option in self.params:
             unit = re.search(r"( \[[^]]+\]|)[^]]*$", getattr(option, "help", None) or "")
             for one in _several(ctx.params.get(option.name or "")):
                 if isinstance(one, float) and not math.isfinite(one):
                     raise ValueError(
-                        f"{option.name} must be a finite number{unit[1] if unit else ''}, got {one}: "
+                        f"{option.name} must be a finite number{unit[1] if unit else ''}, got "
+                        f"{one}: "
                         f"give another {option.name}"
                     )
         return rest
@@ -88,7 +97,8 @@ def _several(value: object) -> Sequence[object]:
 
 app = typer.Typer(
     name="dpend",
-    help="The motions of a double pendulum that come back. Angles in degrees, everything else in SI units.",
+    help="The motions of a double pendulum that come back. Angles in degrees, everything else in "
+    "SI units.",
     add_completion=False,
     rich_markup_mode=None,  # square brackets are units here
     pretty_exceptions_enable=False,
@@ -103,7 +113,9 @@ def _number(text: str | float | int) -> float:  # defaults come as what they are
     try:
         return parse_decimal(text)
     except ValueError:
-        raise typer.BadParameter(f"{text!r:.60} is not a number: give one like 40 or 1e-3") from None
+        raise typer.BadParameter(
+            f"{text!r:.60} is not a number: give one like 40 or 1e-3"
+        ) from None
 
 
 # What a count fits in, here and in the compiled programs.
@@ -142,9 +154,12 @@ def _commands() -> None:
 def orbit(
     theta1: _Theta1,
     branch: Annotated[
-        str | None, typer.Option(help="in-phase or anti-phase; both, if neither this nor a guess is given.")
+        str | None,
+        typer.Option(help="in-phase or anti-phase; both, if neither this nor a guess is given."),
     ] = None,
-    theta2: Annotated[float | None, _numeric(help="Guess of the lower rod's release angle [deg].")] = None,
+    theta2: Annotated[
+        float | None, _numeric(help="Guess of the lower rod's release angle [deg].")
+    ] = None,
     period: Annotated[float | None, _numeric(help="Guess of the period [s].")] = None,
     symmetry: Annotated[
         str | None, typer.Option(help="centred or brake, with a guess; found out if not given.")
@@ -152,13 +167,17 @@ def orbit(
     ratio: Annotated[
         int | None,
         typer.Option(
-            parser=_integer, metavar="INTEGER", help="1 or -1: theta2 = ratio theta1, the release nearest to THETA1."
+            parser=_integer,
+            metavar="INTEGER",
+            help="1 or -1: theta2 = ratio theta1, the release nearest to THETA1.",
         ),
     ] = None,
     crossing: Annotated[
         int | None,
         typer.Option(
-            parser=_integer, metavar="INTEGER", help="Which of the branch's passages through theta1; 1 if not given."
+            parser=_integer,
+            metavar="INTEGER",
+            help="Which of the branch's passages through theta1; 1 if not given.",
         ),
     ] = None,
     l1: _Length1 = 0.2,
@@ -173,20 +192,37 @@ def orbit(
     release = _radians("theta1", theta1)
     if (theta2 is None) != (period is None):
         given, missing = ("theta2", "period") if period is None else ("period", "theta2")
-        raise ValueError(f"{missing} must be given with {given}, got {given} alone: a guess is both")
-    guess = None if theta2 is None else (_radians("theta2", theta2), number("period", period, positive=True, unit="s"))
+        raise ValueError(
+            f"{missing} must be given with {given}, got {given} alone: a guess is both"
+        )
+    guess = (
+        None
+        if theta2 is None
+        else (_radians("theta2", theta2), number("period", period, positive=True, unit="s"))
+    )
     if crossing is not None and branch is None:
-        raise ValueError(f"crossing must go with branch, got {crossing} alone: give --branch {' or '.join(BRANCHES)}")
+        raise ValueError(
+            f"crossing must go with branch, got {crossing} alone: give --branch "
+            f"{' or '.join(BRANCHES)}"
+        )
     passage = 1 if crossing is None else crossing
     both = branch is None and guess is None and ratio is None
     with _clock("following the branch" if guess is None else "solving"):
         found = {
             name: dpend.find_orbit(
-                pendulum, release, branch=name, guess=guess, symmetry=symmetry, ratio=ratio, crossing=passage
+                pendulum,
+                release,
+                branch=name,
+                guess=guess,
+                symmetry=symmetry,
+                ratio=ratio,
+                crossing=passage,
             )
             for name in (BRANCHES if both else (branch,))
         }
-    records = [orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()]
+    records = [
+        orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()
+    ]
     if as_json:
         print_json({"orbits": records} if both else records[0])
     else:
@@ -198,7 +234,8 @@ def orbit(
 def family(
     branch: Annotated[str, typer.Option(help="in-phase (slow mode) or anti-phase (fast mode).")],
     out: Annotated[
-        Path | None, typer.Option(help="Write all points to F.csv, or to F.json what --json prints.")
+        Path | None,
+        typer.Option(help="Write all points to F.csv, or to F.json what --json prints."),
     ] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -207,7 +244,9 @@ def family(
     g: _Gravity = 9.8,
     as_json: _Json = False,
 ) -> int:
-    """All orbits of a normal mode, from small swings to the upright pendulum, and where their stability changes."""
+    """All orbits of a normal mode, from small swings to the upright pendulum, and where their
+    stability changes.
+    """
     if branch not in BRANCHES:
         raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
     formats = {".csv": write_family_csv, ".json": write_json}
@@ -230,14 +269,24 @@ def family(
 def atlas(
     max_period: Annotated[float, _numeric(help="The longest period [s].")],
     theta1: Annotated[
-        float | None, _numeric("--theta1", help="Release angle of the upper rod [deg]; the whole square without it.")
+        float | None,
+        _numeric(
+            "--theta1", help="Release angle of the upper rod [deg]; the whole square without it."
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the atlas to F.csv or F.json.")] = None,
     store: Annotated[
-        Path | None, typer.Option(help="Of the whole square: F.json, from which a search that was stopped goes on.")
+        Path | None,
+        typer.Option(
+            help="Of the whole square: F.json, from which a search that was stopped goes on."
+        ),
     ] = None,
     most_steps: Annotated[
-        float, _numeric(help="Refuse a search that takes more time steps, or stop there: 1e9 take about an hour.")
+        float,
+        _numeric(
+            help="Refuse a search that takes more time steps, or stop there: 1e9 take about an "
+            "hour."
+        ),
     ] = float(MOST_SEARCH_STEPS),
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -246,13 +295,19 @@ def atlas(
     g: _Gravity = 9.8,
     as_json: _Json = False,
 ) -> int:
-    """Every orbit released from rest up to a period: of one release angle, or all families of the whole square."""
+    """Every orbit released from rest up to a period: of one release angle, or all families of the
+    whole square.
+    """
     if theta1 is not None and store is not None:
-        raise ValueError(f"store goes with the whole square, got {store} with theta1: leave out either")
+        raise ValueError(
+            f"store goes with the whole square, got {store} with theta1: leave out either"
+        )
     if out is not None:
         check_place("out", out, (".csv", ".json"))
         if store is not None and out.resolve() == store.resolve():
-            raise ValueError(f"out must be another file than store, got {out} for both: give another name")
+            raise ValueError(
+                f"out must be another file than store, got {out} for both: give another name"
+            )
     pendulum = Pendulum(l1, l2, m1, m2, g)
     steps = _steps_of_search(swinging_pendulum(pendulum), max_period, theta1)
     if steps <= most_steps:
@@ -290,10 +345,15 @@ _LONG, _LARGE = 60.0, 1e9
 
 
 def _tell_cost(steps: int | float, seconds: float, size: int | float = 0, more: str = "") -> None:
-    """Says before it begins what takes more than a minute, or more than a gigabyte of `size` [bytes]."""
+    """Says before it begins what takes more than a minute, or more than a gigabyte of `size`
+    [bytes].
+    """
     if seconds > _LONG or size > _LARGE:
         room = f" and {size / 1e9:.2g} GB" if size > _LARGE else ""
-        _complain(f"about {steps:.1e} time steps, which may take {math.ceil(seconds / 60)} minutes{room}{more}")
+        _complain(
+            f"about {steps:.1e} time steps, which may take {math.ceil(seconds / 60)} "
+            f"minutes{room}{more}"
+        )
 
 
 def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None) -> int | float:
@@ -318,7 +378,10 @@ def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
             show(done, planned)
             if not on_terminal() and time.perf_counter() - last > _BETWEEN_LINES:
                 last = time.perf_counter()
-                print(f"dpend: {done:.3g} of about {planned:.3g} {unit}, {last - started:.0f} s", file=sys.stderr)
+                print(
+                    f"dpend: {done:.3g} of about {planned:.3g} {unit}, {last - started:.0f} s",
+                    file=sys.stderr,
+                )
 
         yield tell
 
@@ -327,17 +390,25 @@ def _work(unit: str) -> Iterator[Callable[[float, float], None]]:
 def design(
     theta1: _Theta1,
     branch: Annotated[
-        str | None, typer.Option(help="in-phase or anti-phase: whose orbit --period and --kappa are about.")
+        str | None,
+        typer.Option(help="in-phase or anti-phase: whose orbit --period and --kappa are about."),
     ] = None,
     period: Annotated[float | None, _numeric(help="Wanted period [s].")] = None,
-    kappa: Annotated[float | None, _numeric(help="Wanted kappa: stable from -1 to 1, most so at 0.")] = None,
-    ratio: Annotated[
-        float | None, _numeric(help="Wanted period of the in-phase orbit over that of the anti-phase orbit.")
+    kappa: Annotated[
+        float | None, _numeric(help="Wanted kappa: stable from -1 to 1, most so at 0.")
     ] = None,
-    free: Annotated[str, typer.Option(metavar="NAMES", help="What may change, of l1,l2,m1,m2,g,theta1.")] = "l1,l2",
+    ratio: Annotated[
+        float | None,
+        _numeric(help="Wanted period of the in-phase orbit over that of the anti-phase orbit."),
+    ] = None,
+    free: Annotated[
+        str, typer.Option(metavar="NAMES", help="What may change, of l1,l2,m1,m2,g,theta1.")
+    ] = "l1,l2",
     bounds: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=A:B", help="Bounds of one of them (theta1 in degrees); once a name."),
+        typer.Option(
+            metavar="NAME=A:B", help="Bounds of one of them (theta1 in degrees); once a name."
+        ),
     ] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
@@ -346,11 +417,15 @@ def design(
     g: _Gravity = 9.8,
     as_json: _Json = False,
 ) -> int:
-    """The pendulum nearest to this one whose orbit released at THETA1 has a wanted period, stability, or both."""
+    """The pendulum nearest to this one whose orbit released at THETA1 has a wanted period,
+    stability, or both.
+    """
     start = Pendulum(l1, l2, m1, m2, g)
     equations, branches = _asked(branch, period, kappa, ratio)
     if not 0 < number("theta1", theta1, unit="deg") < 180:
-        raise ValueError(f"theta1 must be between 0 and 180 deg, got {theta1:g}: give another theta1")
+        raise ValueError(
+            f"theta1 must be between 0 and 180 deg, got {theta1:g}: give another theta1"
+        )
 
     def loss(*orbits: PeriodicOrbit) -> Any:
         by_name = dict(zip(branches, orbits, strict=True))
@@ -358,7 +433,9 @@ def design(
 
     names, limits, angle = _names(free), _bounds(bounds or []), _radians("theta1", theta1)
     with _clock("designing"):
-        found = dpend.design_pendulum(loss, start, names, branch=branches, theta1=angle, bounds=limits)
+        found = dpend.design_pendulum(
+            loss, start, names, branch=branches, theta1=angle, bounds=limits
+        )
     record = design_record(found, start, branches, tuple(equations))
     if as_json:
         print_json(record)
@@ -376,20 +453,30 @@ def simulate(
     theta1: _Theta1,
     theta2: Annotated[float, _numeric(help="Release angle of the lower rod [deg].")],
     duration: Annotated[float, _numeric(help="How long [s]; negative runs backwards.")],
-    p1: Annotated[float, _numeric("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")] = 0.0,
-    p2: Annotated[float, _numeric("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")] = 0.0,
+    p1: Annotated[
+        float, _numeric("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")
+    ] = 0.0,
+    p2: Annotated[
+        float, _numeric("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")
+    ] = 0.0,
     method: Annotated[
         str | None,
-        typer.Option(help="rk4, rk8 (default for a step), gauss, rk4-circle or rk8-circle (for a tolerance)."),
+        typer.Option(
+            help="rk4, rk8 (default for a step), gauss, rk4-circle or rk8-circle (for a tolerance)."
+        ),
     ] = None,
     step: Annotated[float | None, _numeric(help="Largest step [s].")] = None,
     tolerance: Annotated[
-        float | None, _numeric(help="Wanted error of the angles [rad]; 1e-9 if no step is given either.")
+        float | None,
+        _numeric(help="Wanted error of the angles [rad]; 1e-9 if no step is given either."),
     ] = None,
     most_steps: Annotated[
-        int, typer.Option(parser=_integer, metavar="INTEGER", help="How many steps are taken at most.")
+        int,
+        typer.Option(parser=_integer, metavar="INTEGER", help="How many steps are taken at most."),
     ] = MOST_MOTION_STEPS,
-    out: Annotated[Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")
+    ] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -399,13 +486,21 @@ def simulate(
 ) -> int:
     """The motion from a release, and how far its end may be believed."""
     pendulum = Pendulum(l1, l2, m1, m2, g)
-    state = State(_radians("theta1", theta1), _radians("theta2", theta2), number("p1", p1), number("p2", p2))
+    state = State(
+        _radians("theta1", theta1), _radians("theta2", theta2), number("p1", p1), number("p2", p2)
+    )
     write = writer(out) if out is not None else None
     if step is not None and step > 0 and (steps := abs(duration / step)) <= most_steps:
         _tell_cost(steps, steps / _STEPS_A_SECOND, steps * _BYTES_A_STEP)
     with _clock("integrating"):
         motion = dpend.simulate(
-            pendulum, state, duration, step=step, method=method, tolerance=tolerance, most_steps=most_steps
+            pendulum,
+            state,
+            duration,
+            step=step,
+            method=method,
+            tolerance=tolerance,
+            most_steps=most_steps,
         )
     if write is not None:
         write(motion)
@@ -422,19 +517,30 @@ def map_command(
     quantity: Annotated[str, typer.Argument(help="lyapunov, megno, flip or drift.")],
     size: Annotated[str, typer.Option(metavar="N|NxM", help="Cells along theta1 and theta2.")],
     duration: Annotated[float, _numeric(help="How long each motion lasts [s].")],
-    out: Annotated[Path, typer.Option(help="The Zarr store; one left unfinished by the same command is finished.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="The Zarr store; one left unfinished by the same command is finished."),
+    ],
     theta1: Annotated[str, typer.Option(metavar="A:B", help="Range of theta1 [deg].")] = "-180:180",
     theta2: Annotated[str, typer.Option(metavar="A:B", help="Range of theta2 [deg].")] = "-180:180",
     tolerance: Annotated[
-        float | None, _numeric(help="Wanted error of the angles [rad]; 1e-6 if no method is given either.")
+        float | None,
+        _numeric(help="Wanted error of the angles [rad]; 1e-6 if no method is given either."),
     ] = None,
-    method: Annotated[str | None, typer.Option(help=f"One of {', '.join(METHODS)}, with --step.")] = None,
+    method: Annotated[
+        str | None, typer.Option(help=f"One of {', '.join(METHODS)}, with --step.")
+    ] = None,
     step: Annotated[float | None, _numeric(help="Step [s], with --method.")] = None,
     error: Annotated[
-        str | None, typer.Option(help="half-step: a second pass at half the step, and an error for each cell.")
+        str | None,
+        typer.Option(help="half-step: a second pass at half the step, and an error for each cell."),
     ] = None,
     most_steps: Annotated[
-        float, _numeric("--most-steps", help="Refuse a map of more steps, or a motion of more than a millionth of it.")
+        float,
+        _numeric(
+            "--most-steps",
+            help="Refuse a map of more steps, or a motion of more than a millionth of it.",
+        ),
     ] = 1e12,
     figure: Annotated[Path | None, typer.Option(help="Draw the map into P.png.")] = None,
     l1: _Length1 = 0.2,
@@ -444,7 +550,9 @@ def map_command(
     g: _Gravity = 9.8,
     as_json: _Json = False,
 ) -> int:
-    """A map of the square of releases from rest: chaos, first flips or energy drift, cell by cell."""
+    """A map of the square of releases from rest: chaos, first flips or energy drift, cell by
+    cell.
+    """
     if quantity not in _MAPS:
         raise ValueError(f"map must be one of {', '.join(_MAPS)}, got {quantity!r}")
     if method is not None and method not in METHODS:
@@ -452,7 +560,9 @@ def map_command(
     duration = number("duration", duration, positive=True, unit="s")
     axes = {
         key: _cells(key, text, count)
-        for key, text, count in zip(("theta1", "theta2"), (theta1, theta2), _size(size), strict=True)
+        for key, text, count in zip(
+            ("theta1", "theta2"), (theta1, theta2), _size(size), strict=True
+        )
     }
     check_store("out", out)
     if figure is not None:
@@ -494,15 +604,24 @@ def map_command(
         print_json(record)
     else:
         print(f"{record['cells']} cells in {seconds:.1f} s, {record['failed']} failed", end="; ")
-        print(f"{record['steps_per_second']:.3g} steps/s of {field.attrs['method']}, {field.attrs['step']:.4g} s")
+        print(
+            f"{record['steps_per_second']:.3g} steps/s of {field.attrs['method']}, "
+            f"{field.attrs['step']:.4g} s"
+        )
         print(f"written to {out}" + (f", drawn in {figure}" if figure else ""))
     return 0
 
 
 @app.command(cls=_Command)
 def animate(
-    theta1: Annotated[list[float], _numeric("--theta1", help="Release angle of the upper rod [deg]; once a release.")],
-    theta2: Annotated[list[float], _numeric("--theta2", help="Release angle of the lower rod [deg]; once a release.")],
+    theta1: Annotated[
+        list[float],
+        _numeric("--theta1", help="Release angle of the upper rod [deg]; once a release."),
+    ],
+    theta2: Annotated[
+        list[float],
+        _numeric("--theta2", help="Release angle of the lower rod [deg]; once a release."),
+    ],
     duration: Annotated[float, _numeric(help="How long the motion lasts [s].")],
     out: Annotated[Path, typer.Option(help="F.gif, F.mp4, or F.png with all pictures in one.")],
     speed: Annotated[float, _numeric(help="Seconds of the motion in a second of the film.")] = 1.0,
@@ -513,12 +632,15 @@ def animate(
     g: _Gravity = 9.8,
     as_json: _Json = False,
 ) -> int:
-    """A film of a motion in real time; of several, in one picture, where --theta1 and --theta2 are given again."""
+    """A film of a motion in real time; of several, in one picture, where --theta1 and --theta2 are
+    given again.
+    """
     from dpend import animate as animation
 
     if len(theta1) != len(theta2):
         raise ValueError(
-            f"theta1 and theta2 must be given equally often, got {len(theta1)} and {len(theta2)}: a release is both"
+            f"theta1 and theta2 must be given equally often, got {len(theta1)} and {len(theta2)}: "
+            f"a release is both"
         )
     animation.check_out(out)
     pendulum = Pendulum(l1, l2, m1, m2, g)
@@ -539,7 +661,9 @@ def animate(
     if as_json:
         print_json(record)
     else:
-        print(f"{frames} frames of {len(motions)} motion{'s' * (len(motions) > 1)} written to {out}")
+        print(
+            f"{frames} frames of {len(motions)} motion{'s' * (len(motions) > 1)} written to {out}"
+        )
         for one, two, motion in zip(theta1, theta2, records, strict=True):
             if motion["status"] != "converged":
                 print(f"({one:g}, {two:g}) deg: {motion['status']}: {motion['message']}")
@@ -548,13 +672,21 @@ def animate(
 
 @app.command(cls=_Command)
 def fit(
-    data: Annotated[Path, typer.Argument(help="A CSV file with columns time_s, theta1_deg, theta2_deg.")],
-    free: Annotated[str, typer.Option(help="What to estimate, of l1, l2, m1, m2, g; the rest is held.")] = "l2,m2,g",
+    data: Annotated[
+        Path, typer.Argument(help="A CSV file with columns time_s, theta1_deg, theta2_deg.")
+    ],
+    free: Annotated[
+        str, typer.Option(help="What to estimate, of l1, l2, m1, m2, g; the rest is held.")
+    ] = "l2,m2,g",
     at_rest: Annotated[
         bool, typer.Option("--at-rest", help="The motion was released from rest at the first time.")
     ] = False,
-    noise: Annotated[float | None, _numeric(help="Standard deviation of the angles [deg], if it is known.")] = None,
-    figure: Annotated[Path | None, typer.Option(help="Draw data, fit and residuals into P.png.")] = None,
+    noise: Annotated[
+        float | None, _numeric(help="Standard deviation of the angles [deg], if it is known.")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw data, fit and residuals into P.png.")
+    ] = None,
     l1: _Length1 = 0.2,
     l2: _Length2 = 0.2,
     m1: _Mass1 = 0.1,
@@ -562,12 +694,18 @@ def fit(
     g: _Gravity = 9.8,
     as_json: _Json = False,
 ) -> int:
-    """The pendulum whose motion is nearest to measured angles, from a guess of it; one rod or single cells may lack."""
+    """The pendulum whose motion is nearest to measured angles, from a guess of it; one rod or
+    single cells may lack.
+    """
     if figure is not None:
         check_place("figure", figure, (".png",))
         if figure.resolve() == data.resolve():
-            raise ValueError(f"figure must be another file than data, got {figure} for both: give another name")
-    sigma = None if noise is None else math.radians(number("noise", noise, positive=True, unit="deg"))
+            raise ValueError(
+                f"figure must be another file than data, got {figure} for both: give another name"
+            )
+    sigma = (
+        None if noise is None else math.radians(number("noise", noise, positive=True, unit="deg"))
+    )
     names = _names(free)
     times, theta1, theta2 = dpend.load_angles(data)
     with _clock("fitting"):
@@ -597,15 +735,22 @@ def _radians(name: str, degrees: float) -> float:
 def _asked(
     branch: str | None, period: float | None, kappa: float | None, ratio: float | None
 ) -> tuple[dict[str, Callable[[dict[str, PeriodicOrbit]], Any]], tuple[str, ...]]:
-    """The equations of a design, each a function of the orbits by branch, and the branches whose orbits it takes."""
+    """The equations of a design, each a function of the orbits by branch, and the branches whose
+    orbits it takes.
+    """
     if period is None and kappa is None and ratio is None:
-        raise ValueError("period, kappa or ratio must be given, got none of them: say what is wanted")
+        raise ValueError(
+            "period, kappa or ratio must be given, got none of them: say what is wanted"
+        )
     if branch is None and (period is not None or kappa is not None):
-        raise ValueError(f"branch must be given with period and kappa, got none: give {' or '.join(BRANCHES)}")
+        raise ValueError(
+            f"branch must be given with period and kappa, got none: give {' or '.join(BRANCHES)}"
+        )
     if branch is not None and branch not in BRANCHES:
         raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
     if branch is not None and period is None and kappa is None:
-        raise ValueError(f"branch must go with period or kappa, got {branch!r} with ratio alone, which is of both: "
+        raise ValueError(f"branch must go with period or kappa, got {branch!r} with ratio alone, "
+                         f"which is of both: "
                          "leave it out")  # fmt: skip
     equations: dict[str, Callable[[dict[str, PeriodicOrbit]], Any]] = {}
     if period is not None:
@@ -616,14 +761,18 @@ def _asked(
         equations["kappa"] = lambda orbits: orbits[str(branch)].kappa - middle
     if ratio is not None:
         wanted = float(number("ratio", ratio, positive=True))
-        equations["ratio"] = lambda orbits: orbits["in-phase"].period / orbits["anti-phase"].period - wanted
+        equations["ratio"] = lambda orbits: (
+            orbits["in-phase"].period / orbits["anti-phase"].period - wanted
+        )
     return equations, BRANCHES if ratio is not None else (str(branch),)
 
 
 def _names(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(","))
     if "" in names:
-        raise ValueError(f"free must be names with commas between them, got {text!r}: give them like l2,m2")
+        raise ValueError(
+            f"free must be names with commas between them, got {text!r}: give them like l2,m2"
+        )
     return names
 
 
@@ -635,7 +784,9 @@ def _bounds(texts: list[str]) -> dict[str, tuple[float, float]]:
         try:
             low, high = (parse_decimal(part) for part in span.split(":"))
         except ValueError:
-            raise ValueError(f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5") from None
+            raise ValueError(
+                f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5"
+            ) from None
         if name in bounds:
             raise ValueError(f"bounds must be given once a name, got {name} twice: leave one out")
         bounds[name] = (math.radians(low), math.radians(high)) if name == "theta1" else (low, high)
@@ -692,29 +843,44 @@ def _counts(status: Any) -> tuple[int, int]:
 
 def _size(text: str) -> tuple[int, int]:
     sides = text.lower().split("x")
-    if len(sides) > 2 or not all(re.fullmatch(r"[0-9]{1,99}", side) and int(side) for side in sides):
-        raise ValueError(f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like 512x256")
+    if len(sides) > 2 or not all(
+        re.fullmatch(r"[0-9]{1,99}", side) and int(side) for side in sides
+    ):
+        raise ValueError(
+            f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like "
+            f"512x256"
+        )
     cells = int(sides[0]), int(sides[-1])
     if max(cells) > _MOST_CELLS:
-        raise ValueError(f"size must be at most {_MOST_CELLS} along a side, got {text!r}: map a smaller range")
+        raise ValueError(
+            f"size must be at most {_MOST_CELLS} along a side, got {text!r}: map a smaller range"
+        )
     return cells
 
 
 def _cells(name: str, text: str, count: int) -> np.ndarray:
-    """The centres [rad] of `count` cells of a range A:B [deg]; a symmetric range is one half and its mirror image."""
+    """The centres [rad] of `count` cells of a range A:B [deg]; a symmetric range is one half and
+    its mirror image.
+    """
     try:
         start, end = (float(part) for part in text.split(":"))
     except ValueError:
-        raise ValueError(f"{name} must be a range A:B in degrees, got {text!r}: give one like -180:180") from None
+        raise ValueError(
+            f"{name} must be a range A:B in degrees, got {text!r}: give one like -180:180"
+        ) from None
     if not (math.isfinite(start) and math.isfinite(end) and start < end):
-        raise ValueError(f"{name} must be a range A:B with A below B, got {text!r}: give one like -180:180")
+        raise ValueError(
+            f"{name} must be a range A:B with A below B, got {text!r}: give one like -180:180"
+        )
     centres = np.radians(start + (np.arange(count) + 0.5) * ((end - start) / count))
     return 0.5 * (centres - centres[::-1]) if start == -end else centres
 
 
 @contextlib.contextmanager
 def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
-    """A progress bar on standard error with the time left, and the rate where steps are told too."""
+    """A progress bar on standard error with the time left, and the rate where steps are told
+    too.
+    """
     if not shown:
         yield lambda done, total, steps=0: None
         return
@@ -731,7 +897,9 @@ def _bar(shown: bool, unit: str) -> Iterator[Callable[..., None]]:
 
         def show(done: int, total: int, steps: int = 0) -> None:
             millions = steps / max(time.perf_counter() - started, 1e-9) / 1e6
-            progress.update(task, completed=done, total=total, rate=f"{millions:.1f} M steps/s" if steps else "")
+            progress.update(
+                task, completed=done, total=total, rate=f"{millions:.1f} M steps/s" if steps else ""
+            )
 
         yield show
 
@@ -752,7 +920,9 @@ def _clock(doing: str) -> Iterator[None]:
 
 
 def _keep_compiled_code() -> None:
-    """Has JAX keep compiled code in the user's cache directory, or where the user chose: later runs start warm."""
+    """Has JAX keep compiled code in the user's cache directory, or where the user chose: later runs
+    start warm.
+    """
     if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         return
     chosen = os.environ.get("XDG_CACHE_HOME", "")
@@ -776,9 +946,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The entry point: runs one command and exits with its status."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
+            stream.reconfigure(
+                errors="backslashreplace"
+            )  # names of files may be no text in the terminal's encoding
     os.environ.pop("MPLBACKEND", None)  # for windows, of which the program opens none
-    warnings.filterwarnings("ignore", message=".*persistent compilation cache")  # a cache only saves time
+    warnings.filterwarnings(
+        "ignore", message=".*persistent compilation cache"
+    )  # a cache only saves time
     catch_interrupts()
     status = _run(sys.argv[1:] if arguments is None else list(arguments))
     leave_quietly()
@@ -799,11 +973,14 @@ def _flush() -> OSError | None:
 
 def _run(arguments: list[str]) -> int:
     try:
-        # The process is this program's own, so that float64 is ours to switch on even where JAX is to be left plain.
+        # The process is this program's own, so that float64 is ours to switch on even where JAX is
+        # to be left plain.
         if "JAX_ENABLE_X64" not in os.environ:
             jax.config.update("jax_enable_x64", True)
         _keep_compiled_code()
-        with np.errstate(all="ignore"):  # what overflows is told by the status or by the line that refuses it
+        with np.errstate(
+            all="ignore"
+        ):  # what overflows is told by the status or by the line that refuses it
             status = int(app(arguments or ["--help"], standalone_mode=False) or 0)
         lost = _flush()
         if isinstance(lost, BrokenPipeError):
@@ -813,7 +990,10 @@ def _run(arguments: list[str]) -> int:
         return status
     except (KeyboardInterrupt, typer.Abort):
         return 130
-    except (BrokenPipeError, SystemExit):  # the latter is typer's answer to a closed pipe, and to nothing else here
+    except (
+        BrokenPipeError,
+        SystemExit,
+    ):  # the latter is typer's answer to a closed pipe, and to nothing else here
         return 141
     except typer.Exit as stop:
         return stop.exit_code
@@ -832,7 +1012,10 @@ def _tell(error: Exception) -> int:
         _complain(f"there is not enough memory ({error}): give fewer steps, cells or points")
         return 1
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
-        _complain(f"{error.filename or 'standard output'} cannot be written ({error.strerror}): make room for it")
+        _complain(
+            f"{error.filename or 'standard output'} cannot be written ({error.strerror}): make "
+            f"room for it"
+        )
         return 1
     if not isinstance(error, (ValueError, OSError, RuntimeError)):
         raise error

@@ -1,7 +1,9 @@
-"""Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them), of maps and of fits.
+"""Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them), of maps
+and of fits.
 
-Each function draws into the axes it is given, or into new ones, and returns them. Colours are from Okabe and Ito's
-palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion for the lower.
+Each function draws into the axes it is given, or into new ones, and returns them. Colours are from
+Okabe and Ito's palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion
+for the lower.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -69,15 +71,21 @@ def angles(motion: Trajectory | Any, ax: "Axes | Any | None" = None) -> "Axes":
     _check_motion(motion)
     ax = _axes(ax)
     ax.plot(motion.time, np.degrees(motion.state.theta1), color=UPPER, label="theta1")
-    ax.plot(motion.time, np.degrees(motion.state.theta2), color=LOWER, label="theta2", linestyle="--")
+    ax.plot(
+        motion.time, np.degrees(motion.state.theta2), color=LOWER, label="theta2", linestyle="--"
+    )
     ax.set_xlabel("time (s)")
     ax.set_ylabel("angle (deg)")
     _legend_above(ax, columns=2)
     return ax
 
 
-def energy(pendulum: Pendulum | Any, motion: Trajectory | Any, ax: "Axes | Any | None" = None) -> "Axes":
-    """Kinetic and potential energy of both bobs [J] against time [s], each bob's zero where it hangs at rest."""
+def energy(
+    pendulum: Pendulum | Any, motion: Trajectory | Any, ax: "Axes | Any | None" = None
+) -> "Axes":
+    """Kinetic and potential energy of both bobs [J] against time [s], each bob's zero where it
+    hangs at rest.
+    """
     check_pendulum(pendulum)
     _check_motion(motion)
     ax = _axes(ax)
@@ -96,7 +104,10 @@ def energy(pendulum: Pendulum | Any, motion: Trajectory | Any, ax: "Axes | Any |
 
 
 def strobe(
-    pendulum: Pendulum | Any, motion: Trajectory | Any, ax: "Axes | Any | None" = None, every: int | Any = 1
+    pendulum: Pendulum | Any,
+    motion: Trajectory | Any,
+    ax: "Axes | Any | None" = None,
+    every: int | Any = 1,
 ) -> "Axes":
     """The rods at every `every`-th saved time [positions in m], later ones darker."""
     check_pendulum(pendulum)
@@ -118,7 +129,8 @@ def strobe(
 
 
 def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
-    """One row for each named orbit: the rods over half a period, its path, and its angles over one period.
+    """One row for each named orbit: the rods over half a period, its path, and its angles over one
+    period.
 
     Raises:
         ValueError: no dictionary of single orbits that are known.
@@ -126,16 +138,23 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
     import matplotlib.pyplot as plt
 
     if not isinstance(orbits, dict) or not orbits:
-        raise ValueError(f"orbits must be a dictionary of orbits, got {shown(orbits)}: give one like {{'A': orbit}}")
+        raise ValueError(
+            f"orbits must be a dictionary of orbits, got {shown(orbits)}: give one like "
+            f"{{'A': orbit}}"
+        )
     for name, orbit in orbits.items():
         instance(f"orbits[{name!r}]", orbit, PeriodicOrbit, "what dpend.find_orbit returns")
         single(f"orbits[{name!r}]", orbit.period)
 
-    fig, grid = plt.subplots(len(orbits), 3, figsize=(10.5, 3.3 * len(orbits)), layout="constrained", squeeze=False)
+    fig, grid = plt.subplots(
+        len(orbits), 3, figsize=(10.5, 3.3 * len(orbits)), layout="constrained", squeeze=False
+    )
     steps = 20 * (_STROBES - 1)  # over half a period, so that the strobes fall on both rests
     for (name, orbit), row in zip(orbits.items(), grid, strict=True):
         period = float(orbit.period)
-        whole = simulate(orbit.pendulum, orbit.state, period, step=period / (2 * steps), error=False)
+        whole = simulate(
+            orbit.pendulum, orbit.state, period, step=period / (2 * steps), error=False
+        )
         half = Trajectory(
             whole.time[: steps + 1],
             jax.tree.map(lambda leaf: leaf[: steps + 1], whole.state),
@@ -145,7 +164,10 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
         path(whole, row[1])
         angles(whole, row[2])
         row[0].set_title(f"{name}, {period / (2 * (_STROBES - 1)):.3f} s apart", fontsize="medium")
-        row[1].set_title(f"({np.degrees(orbit.theta1):.4f}, {np.degrees(orbit.theta2):.4f}) deg", fontsize="medium")
+        row[1].set_title(
+            f"({np.degrees(orbit.theta1):.4f}, {np.degrees(orbit.theta2):.4f}) deg",
+            fontsize="medium",
+        )
         row[2].set_title(f"T = {period:.6f} s, {orbit.stability}", fontsize="medium")
     return fig
 
@@ -162,13 +184,15 @@ def family(
     colour: str | Any = UPPER,
     label: str | Any = "",
 ) -> "Axes":
-    """A family of orbits: solid where they are stable (|kappa| <= 1), dashed where not, its special points marked.
+    """A family of orbits: solid where they are stable (|kappa| <= 1), dashed where not, its special
+    points marked.
 
-    Circles are where that changes, triangles folds, ticks resonances. A family whose releases lie to the left is drawn
-    in the mirror.
+    Circles are where that changes, triangles folds, ticks resonances. A family whose releases lie
+    to the left is drawn in the mirror.
 
     Arguments:
-        plane: `angles` for the releases (theta1, theta2) [deg], `period` for the period [s] against the energy [J].
+        plane: `angles` for the releases (theta1, theta2) [deg], `period` for the period [s] against
+            the energy [J].
     Raises:
         ValueError: another plane; no colour of matplotlib's.
     """
@@ -177,7 +201,9 @@ def family(
     instance("curve", curve, Family, "what dpend.follow_family returns")
     plane = one_of("plane", plane, ("angles", "period"))
     if not is_color_like(colour):
-        raise ValueError(f'colour must be one that matplotlib knows, got {shown(colour)}: give one like "black"')
+        raise ValueError(
+            f'colour must be one that matplotlib knows, got {shown(colour)}: give one like "black"'
+        )
     if not isinstance(label, str):
         raise ValueError(f'label must be text, got {shown(label)}: give one like "in phase"')
     ax = _axes(ax)
@@ -191,15 +217,25 @@ def family(
 
     x, y = where(curve.orbits)
     stable = np.asarray(curve.orbits.log_abs_kappa) <= 1e-9
-    # A piece between a stable and an unstable orbit is drawn as unstable, up to the point where that changes.
+    # A piece between a stable and an unstable orbit is drawn as unstable, up to the point where
+    # that changes.
     pieces = stable[:-1] & stable[1:]
     ax.plot(x, y, color=colour, linestyle=(0, (4, 2)), linewidth=1.1)
     solid = np.append(pieces, False) | np.append(False, pieces)
     ax.plot(np.where(solid, x, np.nan), y, color=colour, linewidth=1.8, label=label or None)
     for start, mark in _MARKS.items():
-        spots = [where(point.orbit) for point in curve.special_points if point.kind.startswith(start)]
+        spots = [
+            where(point.orbit) for point in curve.special_points if point.kind.startswith(start)
+        ]
         if spots:
-            ax.plot(*np.transpose(spots), mark, color=colour, markerfacecolor="white", markersize=6, linestyle="none")
+            ax.plot(
+                *np.transpose(spots),
+                mark,
+                color=colour,
+                markerfacecolor="white",
+                markersize=6,
+                linestyle="none",
+            )
     ax.set_xlabel("theta1 (deg)" if plane == "angles" else "energy (J)")
     ax.set_ylabel("theta2 (deg)" if plane == "angles" else "period (s)")
     return ax
@@ -215,16 +251,18 @@ _LABELS = {
 }
 
 
-# Cells along a picture's side; of larger maps every n-th cell is drawn, more than a screen shows anyway.
+# Cells along a picture's side; of larger maps every n-th cell is drawn, more than a screen shows
+# anyway.
 _MOST_CELLS = 1500
 
 
 def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" = None) -> "Axes":
-    """One value of a two-dimensional sweep in colours, its first axis to the right, its second upwards.
+    """One value of a two-dimensional sweep in colours, its first axis to the right, its second
+    upwards.
 
-    Angles are in degrees. Values over decades (errors, drifts, times) have a logarithmic scale. Cells without a finite
-    value are white: failed ones, and on a flip map those that do not flip; there a line bounds the releases that lack
-    the energy for it.
+    Angles are in degrees. Values over decades (errors, drifts, times) have a logarithmic scale.
+    Cells without a finite value are white: failed ones, and on a flip map those that do not flip;
+    there a line bounds the releases that lack the energy for it.
 
     Arguments:
         dataset: what `sweep` returned.
@@ -242,7 +280,9 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
     name = one_of("name", first if name is None else name, names)
     field = dataset[name]
     if field.ndim != 2:
-        raise ValueError(f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve")
+        raise ValueError(
+            f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve"
+        )
     ax = _axes(ax)
     every = -(-max(field.shape) // _MOST_CELLS)
     dataset = dataset.isel({dim: slice(None, None, every) for dim in field.dims})
@@ -254,13 +294,17 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
     values = np.asarray(field.values, np.float64).T
     values = np.where(np.isfinite(values), values, np.nan)
     # Quantiles: a few extreme cells would leave no colour to the others.
-    positive = values[np.isfinite(values) & (values > 0)] if decades else values[np.isfinite(values)]
+    positive = (
+        values[np.isfinite(values) & (values > 0)] if decades else values[np.isfinite(values)]
+    )
     low, high = np.quantile(positive, [0.005, 0.995]) if positive.size else (0.1, 1.0)
     scale = matplotlib.colors.LogNorm if decades else matplotlib.colors.Normalize
     norm = scale(low, max(high, low + 0.01 * abs(low)))
     values = np.where(values <= 0, low, values) if decades else values
     x, y = (_shown(dataset, key) for key in (across, up))
-    mesh = ax.pcolormesh(x, y, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True)
+    mesh = ax.pcolormesh(
+        x, y, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True
+    )
     assert ax.figure is not None
     ax.figure.colorbar(mesh, ax=ax, label=label, extend="both")
     for key, axis in ((across, ax.xaxis), (up, ax.yaxis)):
@@ -284,35 +328,63 @@ def _shown(dataset: Any, key: str) -> np.ndarray:
 
 
 def _no_flip(dataset: Any, ax: "Axes", across: str) -> None:
-    """The line inside which releases from rest lie below both saddles in which one rod points upwards."""
+    """The line inside which releases from rest lie below both saddles in which one rod points
+    upwards.
+    """
     at = dataset.attrs
     if at.get("at_p1") or at.get("at_p2") or not at["g"] > 0:
         return
     weight1, weight2 = (at["m1"] + at["m2"]) * at["l1"], at["m2"] * at["l2"]
     theta1, theta2 = (_shown(dataset, key) for key in ("theta1", "theta2"))
-    height = -weight1 * np.cos(np.radians(theta1))[:, None] - weight2 * np.cos(np.radians(theta2))[None, :]
+    height = (
+        -weight1 * np.cos(np.radians(theta1))[:, None]
+        - weight2 * np.cos(np.radians(theta2))[None, :]
+    )
     saddle = -abs(weight1 - weight2)
     arguments = (theta1, theta2, height.T) if across == "theta1" else (theta2, theta1, height)
     ax.contour(*arguments, levels=[saddle], colors="black", linewidths=1.0)
 
 
 def residuals(fit: Fit | Any) -> "Figure":
-    """A fit over its data: the angles [deg], and what is left of them beside a band of twice the noise to either side.
+    """A fit over its data: the angles [deg], and what is left of them beside a band of twice the
+    noise to either side.
 
-    Measured angles are dots, shown in the turn in which the fitted motion is, which is drawn as a line; blue for the
-    upper rod and vermilion for the lower.
+    Measured angles are dots, shown in the turn in which the fitted motion is, which is drawn as a
+    line; blue for the upper rod and vermilion for the lower.
     """
     import matplotlib.pyplot as plt
 
     instance("fit", fit, Fit, "what dpend.fit_parameters returns")
     fig, grid = plt.subplots(
-        3, 1, figsize=(9.0, 6.6), sharex=True, layout="constrained", gridspec_kw={"height_ratios": [2.2, 1, 1]}
+        3,
+        1,
+        figsize=(9.0, 6.6),
+        sharex=True,
+        layout="constrained",
+        gridspec_kw={"height_ratios": [2.2, 1, 1]},
     )
-    both = (("theta1", fit.theta1, fit.residual1, UPPER, "-"), ("theta2", fit.theta2, fit.residual2, LOWER, "--"))
+    both = (
+        ("theta1", fit.theta1, fit.residual1, UPPER, "-"),
+        ("theta2", fit.theta2, fit.residual2, LOWER, "--"),
+    )
     band = 2 * float(np.degrees(fit.noise))
     for (name, angle, left, colour, style), ax in zip(both, grid[1:], strict=True):
-        grid[0].plot(fit.time, np.degrees(angle), color=colour, linestyle=style, linewidth=1.0, label=f"{name}, fitted")
-        grid[0].plot(fit.time, np.degrees(angle + left), ".", color=colour, markersize=3, label=f"{name}, measured")
+        grid[0].plot(
+            fit.time,
+            np.degrees(angle),
+            color=colour,
+            linestyle=style,
+            linewidth=1.0,
+            label=f"{name}, fitted",
+        )
+        grid[0].plot(
+            fit.time,
+            np.degrees(angle + left),
+            ".",
+            color=colour,
+            markersize=3,
+            label=f"{name}, measured",
+        )
         ax.axhspan(-band, band, color=NEUTRAL, alpha=0.15, linewidth=0)
         ax.axhline(0, color=NEUTRAL, linewidth=0.8)
         ax.plot(fit.time, np.degrees(left), ".", color=colour, markersize=3)

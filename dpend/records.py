@@ -1,4 +1,6 @@
-"""Files: a place is tried before anything is computed, and a new file takes the old one's place only when whole."""
+"""Files: a place is tried before anything is computed, and a new file takes the old one's place
+only when whole.
+"""
 
 import contextlib
 import json
@@ -11,15 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-# The largest file that is read [bytes]: nearly half a million orbits as JSON, or five million measured samples. Parsing
-# takes about ten times as much memory, 2.5 GB.
+# The largest file that is read [bytes]: nearly half a million orbits as JSON, or five million
+# measured samples. Parsing takes about ten times as much memory, 2.5 GB.
 LARGEST_FILE = 1 << 28
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`, which takes its place if all goes well: a file that is there, old or new, is
-    always whole.
+    """A temporary name beside `path`, which takes its place if all goes well: a file that is there,
+    old or new, is always whole.
     """
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
@@ -35,12 +37,13 @@ def replacing(path: Path) -> Iterator[Path]:
 def read_text(path: Path) -> str:
     """The text of a file that a user names, which is refused unread if it has no end.
 
-    A pipe, a device, or a file that the system makes up while it is read has no size to check. The file is opened so
-    that nothing waits for a writer, and no more is read than its size.
+    A pipe, a device, or a file that the system makes up while it is read has no size to check. The
+    file is opened so that nothing waits for a writer, and no more is read than its size.
 
     Raises:
         OSError: it cannot be opened or read.
-        ValueError: no regular file, one above `LARGEST_FILE`, one that changes meanwhile, or text that is not UTF-8.
+        ValueError: no regular file, one above `LARGEST_FILE`, one that changes meanwhile, or text
+            that is not UTF-8.
     """
     _check_size(os.stat(path))
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -48,7 +51,9 @@ def read_text(path: Path) -> str:
         size = _check_size(os.fstat(handle))
         data = file.read(size + 1)
     if len(data) != size:
-        raise ValueError(f"it has {size} bytes and gives {'more' if len(data) > size else len(data)}")
+        raise ValueError(
+            f"it has {size} bytes and gives {'more' if len(data) > size else len(data)}"
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -65,7 +70,8 @@ def _check_size(status: os.stat_result) -> int:
 
 
 def parse_json(text: str) -> Any:
-    """What JSON says, as strictly as its standard: no key twice, no NaN, and no more levels than Python can follow.
+    """What JSON says, as strictly as its standard: no key twice, no NaN, and no more levels than
+    Python can follow.
 
     Raises:
         ValueError: what is wrong, with the line and column, or the key.
@@ -106,7 +112,8 @@ _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 def parse_decimal(text: str) -> float:
-    """The number that a text says in decimal digits; infinity where it is beyond the largest double.
+    """The number that a text says in decimal digits; infinity where it is beyond the largest
+    double.
 
     Raises:
         ValueError: any other text.

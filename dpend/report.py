@@ -43,7 +43,10 @@ def orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
         "kappa": float(orbit.kappa),
         "log_abs_kappa": float(orbit.log_abs_kappa),
         "stability": orbit.stability,
-        "dual": {"theta1_deg": _degrees(orbit.dual.theta1), "theta2_deg": _degrees(orbit.dual.theta2)},
+        "dual": {
+            "theta1_deg": _degrees(orbit.dual.theta1),
+            "theta2_deg": _degrees(orbit.dual.theta2),
+        },
         "turns": [int(turn) for turn in orbit.turns],
         "error_estimate": {"theta2_deg": _degrees(angle_error), "period_s": float(period_error)},
         "pendulum": pendulum_record(orbit.pendulum),
@@ -66,7 +69,9 @@ def family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
     rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
     return {
         "branch": branch,
-        "points": [dict(zip(columns, row, strict=True)) | {"symmetry": family.symmetry} for row in rows],
+        "points": [
+            dict(zip(columns, row, strict=True)) | {"symmetry": family.symmetry} for row in rows
+        ],
         "bifurcations": [
             {
                 "kind": point.kind,
@@ -82,7 +87,9 @@ def family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
         "ends": list(family.ends),
         "status": status.name.lower(),
         "message": family.message,
-        "pendulum": pendulum_record(Pendulum(*(leaf[0] for leaf in jax.tree.leaves(orbits.pendulum)))),
+        "pendulum": pendulum_record(
+            Pendulum(*(leaf[0] for leaf in jax.tree.leaves(orbits.pendulum)))
+        ),
     }
 
 
@@ -112,11 +119,18 @@ def design_record(
     found: dpend.Design, start: Pendulum, branches: tuple[str, ...], equations: tuple[str, ...]
 ) -> dict[str, Any]:
     status = Status(int(found.status))
-    units = {"theta2_deg": ("theta2", math.degrees(1.0)), "period_s": ("period", 1.0), "kappa": ("kappa", 1.0)}
+    units = {
+        "theta2_deg": ("theta2", math.degrees(1.0)),
+        "period_s": ("period", 1.0),
+        "kappa": ("kappa", 1.0),
+    }
     orbits = []
     for i, (name, orbit) in enumerate(zip(branches, found.orbits, strict=True)):
         slopes = {
-            key: {parameter: unit * float(np.atleast_1d(row)[i]) for parameter, row in found.sensitivities[of].items()}
+            key: {
+                parameter: unit * float(np.atleast_1d(row)[i])
+                for parameter, row in found.sensitivities[of].items()
+            }
             for key, (of, unit) in units.items()
         }
         orbits.append(orbit_record(orbit) | {"branch": name, "sensitivities": slopes})
@@ -136,11 +150,19 @@ def design_record(
 
 # How an estimate is shown: its name with its unit, and what it is multiplied by.
 _SHOWN = {
-    "l1": ("l1_m", 1.0), "l2": ("l2_m", 1.0), "m1": ("m1_kg", 1.0), "m2": ("m2_kg", 1.0), "g": ("g_m_s2", 1.0),
-    "l2/l1": ("l2/l1", 1.0), "m2/m1": ("m2/m1", 1.0), "g/l1": ("g/l1_s-2", 1.0),
-    "theta1": ("theta1_deg", math.degrees(1.0)), "theta2": ("theta2_deg", math.degrees(1.0)),
-    "omega1": ("omega1_deg_s", math.degrees(1.0)), "omega2": ("omega2_deg_s", math.degrees(1.0)),
-}  # fmt: skip
+    "l1": ("l1_m", 1.0),
+    "l2": ("l2_m", 1.0),
+    "m1": ("m1_kg", 1.0),
+    "m2": ("m2_kg", 1.0),
+    "g": ("g_m_s2", 1.0),
+    "l2/l1": ("l2/l1", 1.0),
+    "m2/m1": ("m2/m1", 1.0),
+    "g/l1": ("g/l1_s-2", 1.0),
+    "theta1": ("theta1_deg", math.degrees(1.0)),
+    "theta2": ("theta2_deg", math.degrees(1.0)),
+    "omega1": ("omega1_deg_s", math.degrees(1.0)),
+    "omega2": ("omega2_deg_s", math.degrees(1.0)),
+}
 
 
 def fit_record(fit: dpend.Fit) -> dict[str, Any]:
@@ -193,7 +215,15 @@ def print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> 
     from rich.table import Table
 
     table = Table(title=_described(pendulum), title_justify="left", title_style="")
-    for heading in ("", "theta1 (deg)", "theta2 (deg)", "period (s)", "stability", "kappa", "error (deg, s)"):
+    for heading in (
+        "",
+        "theta1 (deg)",
+        "theta2 (deg)",
+        "period (s)",
+        "stability",
+        "kappa",
+        "error (deg, s)",
+    ):
         table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
     failures = []
     for name, orbit in found.items():
@@ -224,7 +254,15 @@ def print_family(family: dpend.Family, record: dict[str, Any], out: Path | None)
 
     pendulum = Pendulum(*record["pendulum"].values())
     table = Table(title=_described(pendulum), title_justify="left", title_style="")
-    headings = ("theta1 (deg)", "theta2 (deg)", "period (s)", "energy (J)", "stability", "log |kappa|", "")
+    headings = (
+        "theta1 (deg)",
+        "theta2 (deg)",
+        "period (s)",
+        "energy (J)",
+        "stability",
+        "log |kappa|",
+        "",
+    )
     for heading in headings:
         table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
     points = record["points"]
@@ -246,7 +284,10 @@ def print_family(family: dpend.Family, record: dict[str, Any], out: Path | None)
         )
     _print_table(table)
     worst = max(point["theta2_error_deg"] for point in points)
-    print(f"{len(points)} orbits from {family.ends[0]} to {family.ends[1]}; error of theta2 at most {worst:.0e} deg")
+    print(
+        f"{len(points)} orbits from {family.ends[0]} to {family.ends[1]}; error of theta2 at most "
+        f"{worst:.0e} deg"
+    )
     if int(family.status) != Status.CONVERGED:
         print(f"{record['status']}: {record['message']}")
     if out is not None:
@@ -261,7 +302,15 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
     rows = [_family_row(atlas, one) for one in atlas.families]
     what = f"{len(atlas.families)} families with {len(atlas)} orbits in the table"
     if theta1 is not None:
-        headings = ("theta2 (deg)", "period (s)", "symmetry", "stability", "kappa", "dual (deg)", "error (deg)")
+        headings = (
+            "theta2 (deg)",
+            "period (s)",
+            "symmetry",
+            "stability",
+            "kappa",
+            "dual (deg)",
+            "error (deg)",
+        )
         rows = [_atlas_row(orbit) for orbit in atlas.orbits]
         what = f"{len(atlas)} orbits with theta1 = {theta1:g} deg"
     for heading in headings:
@@ -271,11 +320,20 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
     _print_table(table)
     seen = atlas.coverage
     print(f"{what} and periods of at most {atlas.max_period:g} s", end="; ")
-    print(f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, {seen.time_points} times")
+    print(
+        f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, "
+        f"{seen.time_points} times"
+    )
     agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
     if seen.exhausted:
-        print("STOPPED at the most time steps allowed: more is likely to be missing; raise --most-steps")
-    print(f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding number {agree}")
+        print(
+            "STOPPED at the most time steps allowed: more is likely to be missing; raise "
+            "--most-steps"
+        )
+    print(
+        f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding "
+        f"number {agree}"
+    )
     if out is not None:
         print(f"written to {out}")
 
@@ -306,9 +364,15 @@ def print_fit(record: dict[str, Any], figure: Path | None) -> None:
     errors = record["standard_errors"]
     for name, value in record["estimates"].items():
         error = errors[name]
-        known = "held" if error == 0 else "not determined" if error == math.inf else f"+- {error:.2g}"
+        known = (
+            "held" if error == 0 else "not determined" if error == math.inf else f"+- {error:.2g}"
+        )
         print(f"{name:14}{value:16.{_decimals(error)}f}  {known}")
-    print(f"{record['angles']} angles over {record['duration_s']:g} s; noise {record['noise_deg']:.3g} deg", end="")
+    print(
+        f"{record['angles']} angles over {record['duration_s']:g} s; noise "
+        f"{record['noise_deg']:.3g} deg",
+        end="",
+    )
     print(f", of which {record['expected_noise_deg']:.3g} deg was expected")
     if record["status"] != "converged":
         print(f"{record['status']}: {record['message']}")
@@ -322,16 +386,21 @@ def _decimals(error: float) -> int:
 
 
 def _described(pendulum: Pendulum) -> str:
-    values = (float(value) for value in jax.tree.leaves(pendulum))
-    return "l1 = {:g} m, l2 = {:g} m, m1 = {:g} kg, m2 = {:g} kg, g = {:g} m/s^2, released from rest".format(*values)
+    l1, l2, m1, m2, g = (f"{float(value):g}" for value in jax.tree.leaves(pendulum))
+    bobs = f"l1 = {l1} m, l2 = {l2} m, m1 = {m1} kg, m2 = {m2} kg"
+    return f"{bobs}, g = {g} m/s^2, released from rest"
 
 
-def print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, theta1: float) -> None:
+def print_design(
+    found: dpend.Design, record: dict[str, Any], start: Pendulum, theta1: float
+) -> None:
     from rich.table import Table
 
     branches = (orbit["branch"] for orbit in record["orbits"])
     print_orbits(found.pendulum, dict(zip(branches, found.orbits, strict=True)))
-    table = Table(title="derivatives with respect to the logarithms", title_justify="left", title_style="")
+    table = Table(
+        title="derivatives with respect to the logarithms", title_justify="left", title_style=""
+    )
     table.add_column("")
     for heading in ("start", "found"):
         table.add_column(heading, justify="right")
@@ -342,13 +411,22 @@ def print_design(found: dpend.Design, record: dict[str, Any], start: Pendulum, t
     angle = record["orbits"][0]["theta1_deg"]
     values = [*jax.tree.leaves(start), theta1], [*jax.tree.leaves(found.pendulum), angle]
     for (name, unit), before, after in zip(units.items(), *values, strict=True):
-        slopes = [orbit["sensitivities"][key][name] for orbit in record["orbits"] for key in _SLOPES]
+        slopes = [
+            orbit["sensitivities"][key][name] for orbit in record["orbits"] for key in _SLOPES
+        ]
         row = [f"{float(before):g}", f"{float(after):.10g}", *(f"{slope:.6g}" for slope in slopes)]
         table.add_row(f"{name} ({unit})", *row)
     _print_table(table)
     missed = ", ".join(f"{name} {value:.0e}" for name, value in record["missed"].items())
-    print(f"{record['iterations']} steps, {record['looks']} solves; misses {missed}; logarithms changed by", end=" ")
-    print(f"{record['distance']:.6g}" + (f"; at bounds: {', '.join(found.at_bounds)}" if found.at_bounds else ""))
+    print(
+        f"{record['iterations']} steps, {record['looks']} solves; misses {missed}; logarithms "
+        f"changed by",
+        end=" ",
+    )
+    print(
+        f"{record['distance']:.6g}"
+        + (f"; at bounds: {', '.join(found.at_bounds)}" if found.at_bounds else "")
+    )
     if record["status"] != "converged":
         print(f"{record['status']}: {record['message']}")
 
@@ -361,8 +439,13 @@ def print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) -
     angles = f"theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg"
     print(f"after {record['duration_s']:g} s   {angles}")
     print(f"                p1 = {final['p1']:.12g}, p2 = {final['p2']:.12g} kg m^2/s")
-    print(f"error estimate  {record['error_estimate']:.1e} rad, energy drift {record['energy_drift']:.1e} of its scale")
-    print(f"integrated by   {record['method']}, {record['steps']} steps of {record['step_s']:.4g} s")
+    print(
+        f"error estimate  {record['error_estimate']:.1e} rad, energy drift "
+        f"{record['energy_drift']:.1e} of its scale"
+    )
+    print(
+        f"integrated by   {record['method']}, {record['steps']} steps of {record['step_s']:.4g} s"
+    )
     if record["status"] != "converged":
         print(f"{record['status']}: {record['message']}")
     if out is not None:
@@ -370,7 +453,9 @@ def print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) -
 
 
 def writer(path: Path) -> Callable[[Trajectory], None]:
-    """How to write a motion to `path`; refuses before anything is computed what could not be written after."""
+    """How to write a motion to `path`; refuses before anything is computed what could not be
+    written after.
+    """
     formats = {".csv": _write_csv, ".nc": _write_netcdf}
     check_place("out", path, tuple(formats))
 
@@ -415,7 +500,9 @@ def draw(field: Any, path: Path) -> None:
 
     names = [name for name in field.data_vars if name not in ("steps", "status", "bob")]
     names = [name for name in names if name != "bob_error"]
-    fig, axes = plt.subplots(1, len(names), figsize=(5.6 * len(names), 4.6), layout="constrained", squeeze=False)
+    fig, axes = plt.subplots(
+        1, len(names), figsize=(5.6 * len(names), 4.6), layout="constrained", squeeze=False
+    )
     for name, ax in zip(names, axes[0], strict=True):
         plots.map_of(field, name, ax)
     with replacing(path) as draft:

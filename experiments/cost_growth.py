@@ -1,7 +1,8 @@
 """What time and memory grow with: lanes from 1 to ten million, duration, tangents, and a store.
 
-A straight line in each, or an explanation: times are medians of warm calls, memory is the peak of a process that does
-nothing else. Writes `cost_growth.csv` and the figure; `--quick` takes small sizes and writes nothing.
+A straight line in each, or an explanation: times are medians of warm calls, memory is the peak of a
+process that does nothing else. Writes `cost_growth.csv` and the figure; `--quick` takes small sizes
+and writes nothing.
 """
 
 import argparse
@@ -64,14 +65,24 @@ def seconds(job, least: float = 0.5) -> tuple[float, float]:
 def swept(side: int, duration: float = 0.5, **options):
     import dpend
 
-    return dpend.sweep(partial(end, duration=duration), dpend.Pendulum(), grid(side), **({"tolerance": 1e-6} | options))
+    return dpend.sweep(
+        partial(end, duration=duration),
+        dpend.Pendulum(),
+        grid(side),
+        **({"tolerance": 1e-6} | options),
+    )
 
 
 def tell_memory(side: int) -> None:
     swept(side)
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
-    print(next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM")), float("nan")))
+    print(
+        next(
+            (int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM")),
+            float("nan"),
+        )
+    )
 
 
 def measured(quick: bool) -> list[tuple[str, str, float, float, float, float]]:
@@ -84,7 +95,8 @@ def measured(quick: bool) -> list[tuple[str, str, float, float, float, float]]:
         median, first = seconds(job, 0.1 if quick else 0.5)
         rows.append((what, of, size, median, first, memory))
         print(
-            f"{what:10s} {of:34s} {size:10g}  {median:10.4g} s   first call {first:6.2f} s   {memory:7.0f} MB",
+            f"{what:10s} {of:34s} {size:10g}  {median:10.4g} s   first call {first:6.2f} "
+            f"s   {memory:7.0f} MB",
             flush=True,
         )
 
@@ -93,14 +105,21 @@ def measured(quick: bool) -> list[tuple[str, str, float, float, float, float]]:
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         add("lanes", "sweep to 1e-6 rad, 0.5 s", side**2, partial(swept, side), float(done.stdout))
     for duration in DURATIONS[:3] if quick else DURATIONS:
-        for options in ({"tolerance": 1e-6}, {"tolerance": None, "method": "rk8-circle", "step": 5e-3}):
+        for options in (
+            {"tolerance": 1e-6},
+            {"tolerance": None, "method": "rk8-circle", "step": 5e-3},
+        ):
             name = options.get("method") or "for a tolerance"
             add("duration", f"64 x 64, {name}", duration, partial(swept, 64, duration, **options))
     side = 32 if quick else 128
     for method, step in (("rk4-circle", 1e-3), ("rk8-circle", 5e-3), ("rk8-circle-rescaled", 0.03)):
         options = {"method": method, "step": step}
         for count in TANGENTS:
-            quantity = partial(with_tangents, duration=1.0, count=count) if count else partial(end, duration=1.0)
+            quantity = (
+                partial(with_tangents, duration=1.0, count=count)
+                if count
+                else partial(end, duration=1.0)
+            )
             add(
                 "tangents",
                 f"{side} x {side}, {method}",
@@ -140,22 +159,54 @@ def draw(rows: list) -> None:
     lanes = [row for row in rows if row[0] == "lanes"]
     sizes = [row[2] for row in lanes]
     power = exponent(sizes, [row[3] for row in lanes])
-    left.plot(sizes, [row[3] for row in lanes], "o-", color="#0072B2", label=f"time (s), power {power:.2f} at the end")
-    left.plot(sizes, [row[5] / 1e3 for row in lanes], "s--", color="#D55E00", label="peak memory (GB)")
+    left.plot(
+        sizes,
+        [row[3] for row in lanes],
+        "o-",
+        color="#0072B2",
+        label=f"time (s), power {power:.2f} at the end",
+    )
+    left.plot(
+        sizes, [row[5] / 1e3 for row in lanes], "s--", color="#D55E00", label="peak memory (GB)"
+    )
     left.set(xscale="log", yscale="log", xlabel="lanes", title="a sweep of 0.5 s to 1e-6 rad")
-    for name, colour, marker in (("64 x 64, for a tolerance", "#0072B2", "o"), ("64 x 64, rk8-circle", "#E69F00", "D")):
+    for name, colour, marker in (
+        ("64 x 64, for a tolerance", "#0072B2", "o"),
+        ("64 x 64, rk8-circle", "#E69F00", "D"),
+    ):
         points = [(row[2], row[3]) for row in rows if row[:2] == ("duration", name)]
         power = exponent(*map(list, zip(*points, strict=True)))
-        middle.plot(*zip(*points, strict=True), marker + "-", color=colour, label=f"{name}, power {power:.2f}")
-    middle.set(xscale="log", yscale="log", xlabel="duration (s)", ylabel="time (s)", title="64 x 64 releases")
+        middle.plot(
+            *zip(*points, strict=True),
+            marker + "-",
+            color=colour,
+            label=f"{name}, power {power:.2f}",
+        )
+    middle.set(
+        xscale="log",
+        yscale="log",
+        xlabel="duration (s)",
+        ylabel="time (s)",
+        title="64 x 64 releases",
+    )
     for name, colour, marker in (
         ("rk4-circle", "#0072B2", "s"),
         ("rk8-circle", "#E69F00", "D"),
         ("rk8-circle-rescaled", "#D55E00", "o"),
     ):
-        points = [(row[2], row[3]) for row in rows if row[0] == "tangents" and row[1].endswith(", " + name)]
+        points = [
+            (row[2], row[3])
+            for row in rows
+            if row[0] == "tangents" and row[1].endswith(", " + name)
+        ]
         plain = points[0][1]
-        right.plot([x for x, _ in points], [y / plain for _, y in points], marker + "-", color=colour, label=name)
+        right.plot(
+            [x for x, _ in points],
+            [y / plain for _, y in points],
+            marker + "-",
+            color=colour,
+            label=name,
+        )
     right.set(xlabel="tangent vectors", ylabel="time, of that without", title="tangents along")
     for axis in (left, middle, right):
         axis.grid(alpha=0.3)
@@ -177,7 +228,9 @@ def main() -> None:
     with (HERE / "cost_growth.csv").open("w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["grows", "of", "size", "seconds", "first_call_s", "peak_memory_MB"])
-        table.writerows((what, of, *(f"{value:.4g}" for value in values)) for what, of, *values in rows)
+        table.writerows(
+            (what, of, *(f"{value:.4g}" for value in values)) for what, of, *values in rows
+        )
     draw(rows)
 
 

@@ -1,7 +1,8 @@
-"""How many digits of a number a table shows: those that every processor agrees on, and no more than its error leaves.
+"""How many digits of a number a table shows: those that every processor agrees on, and no more than
+its error leaves.
 
-Error bounds go up to one digit. A number is shown to the place of its bound's digit, which is so far above the
-differences between processors that the same file comes out on each.
+Error bounds go up to one digit. A number is shown to the place of its bound's digit, which is so
+far above the differences between processors that the same file comes out on each.
 """
 
 import math
@@ -18,7 +19,9 @@ def round_up(error: float) -> float:
 
 
 def show(value: float, error: float) -> str:
-    """`value` down to the decimal place of the one digit of `round_up(error)`; as it is where that is zero."""
+    """`value` down to the decimal place of the one digit of `round_up(error)`; as it is where that
+    is zero.
+    """
     bound = round_up(error)
     if not (math.isfinite(bound) and bound > 0) or not math.isfinite(value):
         return f"{value:.12g}"

@@ -1,8 +1,9 @@
-"""A motion in extended precision, to hold others against: shares nothing with dpend and needs NumPy alone.
+"""A motion in extended precision, to hold others against: shares nothing with dpend and needs NumPy
+alone.
 
-Lagrange's equations in angles and angular velocities, in long double (80 bits on x86), by Gragg's midpoint rule with
-Richardson extrapolation until the columns come no closer. Released at (2.9, 3.1) rad, a chaotic motion, it is 1e-14 rad
-from mpmath's Taylor series with 30 digits after 2 s.
+Lagrange's equations in angles and angular velocities, in long double (80 bits on x86), by Gragg's
+midpoint rule with Richardson extrapolation until the columns come no closer. Released at (2.9, 3.1)
+rad, a chaotic motion, it is 1e-14 rad from mpmath's Taylor series with 30 digits after 2 s.
 """
 
 import itertools
@@ -13,7 +14,8 @@ import numpy as np
 _EPS = np.finfo(np.longdouble).eps
 # Midpoint steps 2, 4, 6, ... in each column; so many columns make the order 2, 4, 6, ....
 _GOOD_COLUMNS, _MOST_COLUMNS = 10, 16
-# The columns agree as well as they will where they are within so many units in the last place and come no closer.
+# The columns agree as well as they will where they are within so many units in the last place and
+# come no closer.
 _ROUNDING = 256
 
 
@@ -23,11 +25,12 @@ def is_extended() -> bool:
 
 
 def accelerations(pendulum, state, numpy=np):
-    """The slope of (theta1, theta2, omega1, omega2), in NumPy or in what stands in for it: Lagrange's two equations, by
-    Cramer's rule.
+    """The slope of (theta1, theta2, omega1, omega2), in NumPy or in what stands in for it:
+    Lagrange's two equations, by Cramer's rule.
 
     (m1 + m2) l1 a1 + m2 l2 c a2 = -m2 l2 s omega2^2 - (m1 + m2) g sin theta1
-              l1 c a1 +    l2 a2 =     l1 s omega1^2 -           g sin theta2,   c, s of theta1 - theta2
+              l1 c a1 +    l2 a2 =     l1 s omega1^2 -           g sin theta2,
+    c, s of theta1 - theta2
     """
     l1, l2, m1, m2, g = pendulum
     theta1, theta2, omega1, omega2 = state
@@ -41,7 +44,8 @@ def accelerations(pendulum, state, numpy=np):
 
 
 def motion(pendulum, state, times, longest=0.005):
-    """The states (theta1, theta2, omega1, omega2) at increasing times from zero, in long double, shape (n, 4).
+    """The states (theta1, theta2, omega1, omega2) at increasing times from zero, in long double,
+    shape (n, 4).
 
     Arguments:
         pendulum: (l1, l2, m1, m2, g).
@@ -49,7 +53,12 @@ def motion(pendulum, state, times, longest=0.005):
         longest: no step is longer [s].
     """
     pendulum = [np.longdouble(value) for value in pendulum]
-    state, time, step, rows = np.array(state, np.longdouble), np.longdouble(0), np.longdouble(longest), []
+    state, time, step, rows = (
+        np.array(state, np.longdouble),
+        np.longdouble(0),
+        np.longdouble(longest),
+        [],
+    )
     for end in np.array(times, np.longdouble):
         while time < end:
             taken = min(step, end - time)
@@ -66,7 +75,9 @@ def motion(pendulum, state, times, longest=0.005):
 
 
 def extrapolated(slope, state, step):
-    """The state a step later, better with every column: the midpoint rule with 2, 4, 6, ... substeps, extrapolated."""
+    """The state a step later, better with every column: the midpoint rule with 2, 4, 6, ...
+    substeps, extrapolated.
+    """
     first, row = slope(state), []
     for column in itertools.count(1):
         part = step / (2 * column)
@@ -81,9 +92,13 @@ def extrapolated(slope, state, step):
 
 
 def _converged(pendulum, state, step):
-    """The state a step later and the number of columns that it took, one above the most where they do not agree."""
+    """The state a step later and the number of columns that it took, one above the most where they
+    do not agree.
+    """
     before, change = state, np.inf
-    columns = itertools.islice(extrapolated(partial(accelerations, pendulum), state, step), _MOST_COLUMNS)
+    columns = itertools.islice(
+        extrapolated(partial(accelerations, pendulum), state, step), _MOST_COLUMNS
+    )
     for column, here in enumerate(columns, 1):
         if column > 1:
             change, last = np.max(np.abs(here - before) / (1 + np.abs(state))), change

@@ -1,9 +1,10 @@
-"""Both families of normal modes of the paper's pendulum, to the upright state, and what branches off.
+"""Both families of normal modes of the paper's pendulum, to the upright state, and what branches
+off.
 
-Left the releases in the plane of both angles, right the period against the energy: solid where orbits are stable,
-dashed where not. The six releases that the paper found by hand lie on the two curves. The script prints where stability
-and resonances are, checks orbits of every family with diffrax, and compares how the period grows with the slow exponent
-of the upright equilibrium.
+Left the releases in the plane of both angles, right the period against the energy: solid where
+orbits are stable, dashed where not. The six releases that the paper found by hand lie on the two
+curves. The script prints where stability and resonances are, checks orbits of every family with
+diffrax, and compares how the period grows with the slow exponent of the upright equilibrium.
 """
 
 import argparse
@@ -17,12 +18,21 @@ from dpend import plots
 
 HERE = Path(__file__).parent
 # The paper's motions as printed [deg].
-PAPER = {"A": (64.3, 64.3), "B": (40, 49.1), "C": (10, 14.1), "D": (63.95, -63.95), "E": (40, -51.2), "F": (10, -14.1)}
+PAPER = {
+    "A": (64.3, 64.3),
+    "B": (40, 49.1),
+    "C": (10, 14.1),
+    "D": (63.95, -63.95),
+    "E": (40, -51.2),
+    "F": (10, -14.1),
+}
 PURPLE, GREEN = "#CC79A7", "#009E73"
 
 
 def missed(family: dpend.Family) -> float:
-    """By how much diffrax misses the state at T/2, on five orbits whose kappa leaves ten digits [rad]."""
+    """By how much diffrax misses the state at T/2, on five orbits whose kappa leaves ten digits
+    [rad].
+    """
     known = np.flatnonzero(family.orbits.log_abs_kappa < np.log(1e5))
     worst = 0.0
     for i in known[:: max(1, known.size // 5)][:5]:
@@ -30,12 +40,18 @@ def missed(family: dpend.Family) -> float:
         start = dpend.State(*(float(leaf) for leaf in jax.tree.leaves(orbit.state)))
         half = dpend.reference(orbit.pendulum, start, [float(orbit.period) / 2], error=False).state
         dual = orbit.dual
-        worst = max(worst, float(abs(half.theta1[0] - dual.theta1)), float(abs(half.theta2[0] - dual.theta2)))
+        worst = max(
+            worst,
+            float(abs(half.theta1[0] - dual.theta1)),
+            float(abs(half.theta2[0] - dual.theta2)),
+        )
     return worst
 
 
 def growth(family: dpend.Family) -> tuple[float, float]:
-    """-dT/d ln gap near the end, the gap being E_top - E, and 2/lambda of the upright equilibrium [s]."""
+    """-dT/d ln gap near the end, the gap being E_top - E, and 2/lambda of the upright equilibrium
+    [s].
+    """
     pendulum = jax.tree.map(lambda leaf: float(leaf[0]), family.orbits.pendulum)
     top = dpend.equilibria(pendulum)
     gap = np.asarray(top.energy[3] - family.orbits.energy)
@@ -46,8 +62,13 @@ def growth(family: dpend.Family) -> tuple[float, float]:
 
 def told(name: str, family: dpend.Family) -> None:
     first, last = (float(family.orbits.period[i]) for i in (0, -1))
-    print(f"{name}: {family.symmetry}, {len(family.arclength)} orbits, {' to '.join(family.ends)}", end=", ")
-    print(f"T = {first:.4f} to {last:.4f} s; diffrax misses T/2 by {missed(family):.0e} rad at most")
+    print(
+        f"{name}: {family.symmetry}, {len(family.arclength)} orbits, {' to '.join(family.ends)}",
+        end=", ",
+    )
+    print(
+        f"T = {first:.4f} to {last:.4f} s; diffrax misses T/2 by {missed(family):.0e} rad at most"
+    )
 
 
 def main() -> None:
@@ -70,10 +91,16 @@ def main() -> None:
         told(branch, family)
         slope, expected = growth(family)
         print(f"  -dT/d ln(E_top - E) = {slope:.5f} s near the end, 2/lambda = {expected:.5f} s")
-        print(f"  kappa from {np.min(family.orbits.kappa):.12f} to exp({family.orbits.log_abs_kappa[-1]:.1f})")
+        print(
+            f"  kappa from {np.min(family.orbits.kappa):.12f} to "
+            f"exp({family.orbits.log_abs_kappa[-1]:.1f})"
+        )
         for point in family.special_points:
             angles = np.degrees([point.orbit.theta1, point.orbit.theta2])
-            print(f"  {point.kind:16} ({angles[0]:.8f}, {angles[1]:.8f}) deg, T = {point.orbit.period:.10f} s")
+            print(
+                f"  {point.kind:16} ({angles[0]:.8f}, {angles[1]:.8f}) deg, T = "
+                f"{point.orbit.period:.10f} s"
+            )
             kinds = ("stability_lost", "resonance_2:1", "resonance_3:1")
             if options.quick or point.kind not in kinds:
                 continue
@@ -88,13 +115,21 @@ def main() -> None:
     for name, (theta1, theta2) in PAPER.items():
         axes[0].plot(theta1, theta2, "*", color="black", markersize=9, zorder=5)
         shift = (-4, 8) if theta2 > 0 else (7, 4)
-        axes[0].annotate(name, (theta1, theta2), textcoords="offset points", xytext=shift, fontsize=9)
+        axes[0].annotate(
+            name, (theta1, theta2), textcoords="offset points", xytext=shift, fontsize=9
+        )
     for theta2 in (180, -180):
         axes[0].plot(180, theta2, "x", color="black", markersize=8)
-    axes[0].set(xlim=(-8, 200), ylim=(-215, 200), xticks=range(0, 181, 45), yticks=range(-180, 181, 45))
+    axes[0].set(
+        xlim=(-8, 200), ylim=(-215, 200), xticks=range(0, 181, 45), yticks=range(-180, 181, 45)
+    )
     axes[1].set(xlim=(-0.62, 0.63), ylim=(0, 8.5))
-    axes[1].axvline(dpend.equilibria(pendulum).energy[3], color=plots.NEUTRAL, linewidth=0.8, linestyle=":")
-    axes[1].annotate("upright", (0.588, 8.1), textcoords="offset points", xytext=(-4, 0), ha="right", fontsize=9)
+    axes[1].axvline(
+        dpend.equilibria(pendulum).energy[3], color=plots.NEUTRAL, linewidth=0.8, linestyle=":"
+    )
+    axes[1].annotate(
+        "upright", (0.588, 8.1), textcoords="offset points", xytext=(-4, 0), ha="right", fontsize=9
+    )
     handles, labels = axes[1].get_legend_handles_labels()
     once = dict(zip(labels, handles, strict=True))
     for mark, label in (
@@ -104,7 +139,9 @@ def main() -> None:
         ("*", "the paper's six"),
     ):
         white = "white" if mark in "o^" else "black"
-        once[label] = plt.Line2D([], [], color="black", marker=mark, markerfacecolor=white, linestyle="none")
+        once[label] = plt.Line2D(
+            [], [], color="black", marker=mark, markerfacecolor=white, linestyle="none"
+        )
     axes[1].legend(once.values(), once.keys(), loc="upper left", fontsize="small", frameon=False)
     fig.savefig(options.figure, dpi=110)
     print(f"drawn in {options.figure.name}")

@@ -1,17 +1,20 @@
-"""How long it takes to follow the in-phase family from 0.02 to 3.1 rad: this package beside AUTO-07p, and their errors.
+"""How long it takes to follow the in-phase family from 0.02 to 3.1 rad: this package beside
+AUTO-07p, and their errors.
 
-The pendulum is l1 = l2 = m1 = m2 = g = 1. AUTO solves the boundary value problem over a quarter of the period by
-collocation, with derivatives written out and nothing detected on the way, the least that it can be asked for. dpend's
-time, with which AUTO's is compared, is that of the whole family, on to the homoclinic end, with an error estimate and
-the stability of each orbit, and the special points; cut short by `most_points` where AUTO stops, it is told too. All
-are run in turn, medians beside the fastest and the slowest: the fastest tell more where other programs run. AUTO's
-time is that of its process, compiled before; dpend's is a warm call, and the first call in a new process is told
-beside it.
+The pendulum is l1 = l2 = m1 = m2 = g = 1. AUTO solves the boundary value problem over a quarter of
+the period by collocation, with derivatives written out and nothing detected on the way, the least
+that it can be asked for. dpend's time, with which AUTO's is compared, is that of the whole family,
+on to the homoclinic end, with an error estimate and the stability of each orbit, and the special
+points; cut short by `most_points` where AUTO stops, it is told too. All are run in turn, medians
+beside the fastest and the slowest: the fastest tell more where other programs run. AUTO's time is
+that of its process, compiled before; dpend's is a warm call, and the first call in a new process is
+told beside it.
 
-Errors are the largest over all points up to 3.1 rad, against shooting from the same angles on Lagrange's equations by
-extrapolation in extended precision, which shares nothing with either. AUTO's table has 11 digits, so that its numbers
-are printed in two parts. Its first point is left out: that is the linear motion that it was given. Without AUTO-07p or
-a Fortran compiler only dpend is measured. `--quick` runs less for a test.
+Errors are the largest over all points up to 3.1 rad, against shooting from the same angles on
+Lagrange's equations by extrapolation in extended precision, which shares nothing with either.
+AUTO's table has 11 digits, so that its numbers are printed in two parts. Its first point is left
+out: that is the linear motion that it was given. Without AUTO-07p or a Fortran compiler only dpend
+is measured. `--quick` runs less for a test.
 """
 
 import argparse
@@ -36,8 +39,9 @@ HERE = Path(__file__).parent
 FIRST, LAST = 0.02, 3.1  # [rad]
 ANGLES = 150  # of `Family.at`
 
-# Hamilton's equations in a time that is 1 after a quarter of the period, par(2). What is printed of a solution are
-# theta1(0), the period and theta2(0), first to six decimals and then what that leaves.
+# Hamilton's equations in a time that is 1 after a quarter of the period, par(2). What is printed of
+# a solution are theta1(0), the period and theta2(0), first to six decimals and then what that
+# leaves.
 EQUATIONS = """
 subroutine func(ndim, u, icp, par, ijac, f, dfdu, dfdp)
   implicit none
@@ -73,7 +77,8 @@ subroutine stpnt(ndim, u, par, t)
   integer, intent(in) :: ndim
   double precision, intent(inout) :: u(ndim), par(*)
   double precision, intent(in) :: t
-  double precision, parameter :: a = 0.02d0, ratio = sqrt(2d0), w = sqrt(2 - ratio), quarter = 2*atan(1d0)
+  double precision, parameter :: a = 0.02d0, ratio = sqrt(2d0)
+  double precision, parameter :: w = sqrt(2 - ratio), quarter = 2*atan(1d0)
   par(1:2) = [a, quarter/w]
   u(1:2) = a*cos(quarter*t)*[1d0, ratio]
   u(3:4) = -a*w*sin(quarter*t)*[2 + ratio, 1 + ratio]
@@ -117,9 +122,10 @@ subroutine fopt
 end subroutine
 """
 
-# Boundary values (IPS), pseudo-arclength (ISW) with nothing looked for (ILP, ISP) nor printed of the solutions (NPR)
-# nor of the iterations (IID), until par(1) passes RL1. The period does not count in the arclength (THL). A step is
-# lengthened by half or by a tenth after two or three Newton iterations (ITNW); the tolerances leave no more than that.
+# Boundary values (IPS), pseudo-arclength (ISW) with nothing looked for (ILP, ISP) nor printed of
+# the solutions (NPR) nor of the iterations (IID), until par(1) passes RL1. The period does not
+# count in the arclength (THL). A step is lengthened by half or by a tenth after two or three Newton
+# iterations (ITNW); the tolerances leave no more than that.
 CONSTANTS = """
 NDIM=4, IPS=4, IRS=0, ISW=1, ILP=0, ISP=0, IPLT=0, NBC=5, NINT=0, NPAR=8
 ICP=[1,2,3,4,5,6,7,8], THL={{2: 0.0}}, THU={{}}
@@ -157,14 +163,18 @@ def main() -> None:
 
 
 def cold(longest_step: float) -> None:
-    """Prints the seconds of the import, of the first walk and of the first `at`, in a process that did nothing else."""
+    """Prints the seconds of the import, of the first walk and of the first `at`, in a process that
+    did nothing else.
+    """
     import numpy as np
 
     start = time.perf_counter()
     import dpend
 
     imported = time.perf_counter()
-    family = dpend.follow_family(dpend.Pendulum(1.0, 1.0, 1.0, 1.0, 1.0), "in-phase", longest_step=longest_step)
+    family = dpend.follow_family(
+        dpend.Pendulum(1.0, 1.0, 1.0, 1.0, 1.0), "in-phase", longest_step=longest_step
+    )
     followed = time.perf_counter()
     np.asarray(family.at(np.linspace(FIRST, LAST, ANGLES)).theta2)
     print(json.dumps([imported - start, followed - imported, time.perf_counter() - followed]))
@@ -180,9 +190,15 @@ def compared(directory: Path, quick: bool) -> list[dict]:
     longest_step = 0.1 if quick else 0.0266
     family = dpend.follow_family(pendulum, "in-phase", longest_step=longest_step)
     angles = np.linspace(FIRST, LAST, 10 if quick else ANGLES)
-    imports, firsts, firsts_at = np.median([in_new_process(longest_step) for _ in range(1 if quick else 3)], axis=0)
+    imports, firsts, firsts_at = np.median(
+        [in_new_process(longest_step) for _ in range(1 if quick else 3)], axis=0
+    )
     most = int(np.argmax(np.asarray(family.orbits.theta1) > LAST)) + 1
-    whole, short, at = "follow_family to its end", "follow_family to 3.1 rad", f"family.at of {len(angles)} angles"
+    whole, short, at = (
+        "follow_family to its end",
+        "follow_family to 3.1 rad",
+        f"family.at of {len(angles)} angles",
+    )
     found = {f"dpend, {name}": of_orbits(family.orbits, firsts) for name in (whole, short)}
     found[f"dpend, {at}"] = of_orbits(family.at(angles), firsts_at)
     follow = partial(dpend.follow_family, pendulum, "in-phase", longest_step=longest_step)
@@ -223,28 +239,42 @@ def compared(directory: Path, quick: bool) -> list[dict]:
     return [report(row) for row in rows]
 
 
-HEADER = f"""
-{"":36s}points  seconds (fastest to slowest)   compiling or   largest errors           over dpend's time
-{"":36s}                                          first call   theta2 [rad]  T, share   medians  fastest"""
+HEADER = "\n".join(
+    [
+        "",
+        f"{'':36s}points  seconds (fastest to slowest)   compiling or   largest errors"
+        "           over dpend's time",
+        f"{'':78s}first call   theta2 [rad]  T, share   medians  fastest",
+    ]
+)
 
 
 def report(row: dict) -> dict:
     """The row as it goes into the file, printed."""
-    ratios = (f"{row[key]:9.2f}" for key in ("auto_over_dpend", "auto_over_dpend_fastest") if row[key] > 0)
-    print(
-        f"{row['what']:38s}{row['points']:4d}  {row['seconds']:7.3f} ({row['fastest']:.3f} to {row['slowest']:.3f})"
-        f"{row['compile_or_first_call']:14.2f} s{row['error_theta2_rad']:14.1e}{row['error_period_relative']:12.1e}"
-        + "".join(ratios)
+    ratios = (
+        f"{row[key]:9.2f}" for key in ("auto_over_dpend", "auto_over_dpend_fastest") if row[key] > 0
     )
-    return {key: f"{value:.3g}" if isinstance(value, float) else value for key, value in row.items()}
+    print(
+        f"{row['what']:38s}{row['points']:4d}  {row['seconds']:7.3f} ({row['fastest']:.3f} to "
+        f"{row['slowest']:.3f})"
+        f"{row['compile_or_first_call']:14.2f} "
+        f"s{row['error_theta2_rad']:14.1e}{row['error_period_relative']:12.1e}" + "".join(ratios)
+    )
+    return {
+        key: f"{value:.3g}" if isinstance(value, float) else value for key, value in row.items()
+    }
 
 
 def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def timed(jobs: dict[str, Callable[[], float]], repeats: int) -> tuple[dict[str, list], dict[str, list]]:
-    """The seconds of all calls, made in turn so that all see the same machine, and what the jobs returned."""
+def timed(
+    jobs: dict[str, Callable[[], float]], repeats: int
+) -> tuple[dict[str, list], dict[str, list]]:
+    """The seconds of all calls, made in turn so that all see the same machine, and what the jobs
+    returned.
+    """
     seconds: dict[str, list] = {name: [] for name in jobs}
     returned: dict[str, list] = {name: [] for name in jobs}
     for _ in range(repeats):
@@ -256,14 +286,18 @@ def timed(jobs: dict[str, Callable[[], float]], repeats: int) -> tuple[dict[str,
     return seconds, returned
 
 
-# --- dpend -----------------------------------------------------------------------------------------------------------
+# --- dpend ----------------------------------------------------------------------------------------
 
 
 def in_new_process(longest_step: float) -> list[float]:
     """What `cold` prints, without a cache of compiled code."""
-    environment = {key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
+    environment = {
+        key: value for key, value in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"
+    }
     command = [sys.executable, __file__, "--cold", str(longest_step)]
-    return json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+    return json.loads(
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    )
 
 
 def of_orbits(orbits: Any, first: float) -> Followed:
@@ -272,14 +306,18 @@ def of_orbits(orbits: Any, first: float) -> Followed:
 
     theta1 = np.asarray(orbits.theta1)
     inside = (theta1 >= FIRST) & (theta1 <= LAST)
-    return Followed(theta1[inside], np.asarray(orbits.theta2)[inside], np.asarray(orbits.period)[inside], first)
+    return Followed(
+        theta1[inside], np.asarray(orbits.theta2)[inside], np.asarray(orbits.period)[inside], first
+    )
 
 
-# --- AUTO ------------------------------------------------------------------------------------------------------------
+# --- AUTO -----------------------------------------------------------------------------------------
 
 
 def compiled_auto(directory: Path) -> tuple[Path | None, float]:
-    """AUTO with the equations as one program, None where it cannot be had, and the seconds that compiling took."""
+    """AUTO with the equations as one program, None where it cannot be had, and the seconds that
+    compiling took.
+    """
     command, compiler = shutil.which("auto-07p") or shutil.which("auto"), shutil.which("gfortran")
     places = [Path(os.environ["AUTO_DIR"])] if "AUTO_DIR" in os.environ else []
     if command:
@@ -287,13 +325,19 @@ def compiled_auto(directory: Path) -> tuple[Path | None, float]:
         places += [prefix / "lib" / "auto-07p", prefix]  # as Debian has it, and as its authors
     libraries = [place / "lib" for place in places if (place / "lib" / "solvebv.o").exists()]
     if not libraries or compiler is None:
-        print("no AUTO-07p: not installed" if not libraries else "no AUTO-07p: no gfortran to compile its equations")
+        print(
+            "no AUTO-07p: not installed"
+            if not libraries
+            else "no AUTO-07p: no gfortran to compile its equations"
+        )
         return None, 0.0
     objects = [str(file) for file in sorted(libraries[0].glob("*.o"))]
     source, program = directory / "pendulum.f90", directory / "pendulum"
     source.write_text(EQUATIONS)
     start = time.perf_counter()
-    subprocess.run([compiler, "-O3", "-fopenmp", str(source), *objects, "-o", str(program)], check=True)
+    subprocess.run(
+        [compiler, "-O3", "-fopenmp", str(source), *objects, "-o", str(program)], check=True
+    )
     return program, time.perf_counter() - start
 
 
@@ -301,7 +345,9 @@ def prepared(directory: Path, intervals: int, longest_step: float) -> Path:
     """A folder with AUTO's constants for so many mesh intervals."""
     folder = directory / str(intervals)
     folder.mkdir(exist_ok=True)
-    constants = CONSTANTS.format(intervals=intervals, last=LAST, first_step=0.05, longest_step=longest_step)
+    constants = CONSTANTS.format(
+        intervals=intervals, last=LAST, first_step=0.05, longest_step=longest_step
+    )
     (folder / "fort.2").write_text(constants)
     return folder
 
@@ -309,10 +355,13 @@ def prepared(directory: Path, intervals: int, longest_step: float) -> Path:
 def run_auto(program: Path, folder: Path, threads: int) -> float:
     """One run; the time that AUTO itself prints.
 
-    Its threads wait by spinning: where another process takes a core, several are many times slower than one.
+    Its threads wait by spinning: where another process takes a core, several are many times slower
+    than one.
     """
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-    done = subprocess.run([program], cwd=folder, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [program], cwd=folder, env=environment, capture_output=True, text=True, check=True
+    )
     return float(done.stdout.split("Total Time")[1].split()[0])
 
 
@@ -321,20 +370,25 @@ def of_table(file: Path, first: float) -> Followed:
     import numpy as np
 
     rows = [line.split() for line in file.read_text().splitlines()]
-    values = np.array([row[4:] for row in rows if row[0] != "0"], np.float64)  # par(1), norm, par(2), par(3), ...
+    values = np.array(
+        [row[4:] for row in rows if row[0] != "0"], np.float64
+    )  # par(1), norm, par(2), par(3), ...
     theta1, period, theta2 = (values[:, 3:6] + values[:, 6:9]).T
     inside = (np.arange(len(values)) > 0) & (theta1 <= LAST)
     return Followed(theta1[inside], theta2[inside], period[inside], first)
 
 
-# --- errors ----------------------------------------------------------------------------------------------------------
+# --- errors ---------------------------------------------------------------------------------------
 
 
 def errors_of(found: dict[str, Followed]) -> dict[str, tuple[float, float]]:
     """The largest errors of theta2 [rad] and of the period, relative, each at its own angles."""
     import numpy as np
 
-    columns = [np.concatenate([getattr(f, name) for f in found.values()]) for name in ("theta1", "theta2", "period")]
+    columns = [
+        np.concatenate([getattr(f, name) for f in found.values()])
+        for name in ("theta1", "theta2", "period")
+    ]
     theta1, first, where = np.unique(columns[0], return_index=True, return_inverse=True)
     theta2, period, change = solved(theta1, columns[1][first], columns[2][first])
     print(f"errors are known to {change:.0e}")
@@ -345,7 +399,8 @@ def errors_of(found: dict[str, Followed]) -> dict[str, tuple[float, float]]:
 
 
 def solved(theta1: Any, theta2: Any, period: Any) -> tuple[Any, Any, float]:
-    """Partner angles and periods by Newton's method on theta(T/4) = 0, and their change in its last iteration.
+    """Partner angles and periods by Newton's method on theta(T/4) = 0, and their change in its last
+    iteration.
 
     That takes shorter steps than the one before: the change is also the error that these had made.
     """
@@ -365,7 +420,9 @@ def solved(theta1: Any, theta2: Any, period: Any) -> tuple[Any, Any, float]:
 
 
 def shot(theta1: Any, theta2: Any, time: Any, steps: int, columns: int = 8) -> Any:
-    """Angles and velocities after `time` from rest: the midpoint rule with 2, 4, ... 16 substeps, extrapolated."""
+    """Angles and velocities after `time` from rest: the midpoint rule with 2, 4, ... 16 substeps,
+    extrapolated.
+    """
     import numpy as np
 
     x, step = np.stack([theta1, theta2, 0 * theta1, 0 * theta1]), time / steps

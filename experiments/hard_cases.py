@@ -1,9 +1,11 @@
-"""Tries to break the numerics: ten kinds of hard motions, each with an independent value or bound and a verdict.
+"""Tries to break the numerics: ten kinds of hard motions, each with an independent value or bound
+and a verdict.
 
-What is expected comes from elsewhere: linear theory and elliptic integrals, a quadrature, symmetries of the equations,
-another integrator, or long double (`extended.py`). A row *holds* if the number found is within its bound of the one
-expected, or if what cannot be computed says so; a silent wrong answer *fails*. Writes `hard_cases.csv`, from it the
-table in README.md beside it, and exits with 1 if a row fails. `--quick` takes shorter motions and writes nothing.
+What is expected comes from elsewhere: linear theory and elliptic integrals, a quadrature,
+symmetries of the equations, another integrator, or long double (`extended.py`). A row *holds* if
+the number found is within its bound of the one expected, or if what cannot be computed says so; a
+silent wrong answer *fails*. Writes `hard_cases.csv`, from it the table in README.md beside it, and
+exits with 1 if a row fails. `--quick` takes shorter motions and writes nothing.
 """
 
 import argparse
@@ -43,7 +45,9 @@ class Row:
     verdict: str
 
 
-def near(case: int, what: str, expected: float, found: float, bound: float, unit: str, digits: int = 6) -> Row:
+def near(
+    case: int, what: str, expected: float, found: float, bound: float, unit: str, digits: int = 6
+) -> Row:
     """A number within `bound` of the one expected."""
     verdict = "holds" if abs(found - expected) <= bound else "fails"
     words = (f"{value:.{digits}g} {unit}".strip() for value in (expected, found))
@@ -53,7 +57,9 @@ def near(case: int, what: str, expected: float, found: float, bound: float, unit
 def below(case: int, what: str, source: str, found: float, bound: float, unit: str) -> Row:
     """A difference from `source` of at most `bound`."""
     verdict = "holds" if found <= bound else "fails"
-    return Row(case, what, source, f"{found:.1e} {unit}".strip(), f"{bound:.1g} {unit}".strip(), verdict)
+    return Row(
+        case, what, source, f"{found:.1e} {unit}".strip(), f"{bound:.1g} {unit}".strip(), verdict
+    )
 
 
 def says(case: int, what: str, expected: str, found: str) -> Row:
@@ -74,7 +80,9 @@ def word(status: object) -> str:
     return Status(int(status)).name.lower()
 
 
-def right_or_told(case: int, what: str, release: list[float], duration: float, tolerance: float) -> Row:
+def right_or_told(
+    case: int, what: str, release: list[float], duration: float, tolerance: float
+) -> Row:
     """`simulate` for a tolerance: right to it by long double, or it says that it cannot be."""
     ours = dpend.simulate(PAPER, dpend.released(*release), duration, tolerance=tolerance)
     truth = extended.motion(NUMBERS, (*release, 0.0, 0.0), [duration], longest=0.002)[-1]
@@ -82,10 +90,22 @@ def right_or_told(case: int, what: str, release: list[float], duration: float, t
     error = missed(ours.state, truth)
     if int(ours.status) == Status.CONVERGED:
         return Row(
-            case, what, expected, f"{error:.1e} rad", f"{tolerance:g} rad", "holds" if error <= tolerance else "fails"
+            case,
+            what,
+            expected,
+            f"{error:.1e} rad",
+            f"{tolerance:g} rad",
+            "holds" if error <= tolerance else "fails",
         )
     found = f"{word(ours.status)} ({error:.1e} rad)"
-    return Row(case, what, expected, found, f"{tolerance:g} rad", "holds" if is_told(ours.status) else "fails")
+    return Row(
+        case,
+        what,
+        expected,
+        found,
+        f"{tolerance:g} rad",
+        "holds" if is_told(ours.status) else "fails",
+    )
 
 
 def is_told(status: object) -> bool:
@@ -96,7 +116,12 @@ def is_told(status: object) -> bool:
 def missed(state: State, truth: np.ndarray) -> float:
     """The larger angle's difference at the last time from one in long double."""
     angles = (np.asarray(angle).ravel()[-1] for angle in (state.theta1, state.theta2))
-    return float(max(abs(np.longdouble(angle) - exact) for angle, exact in zip(angles, truth[:2], strict=True)))
+    return float(
+        max(
+            abs(np.longdouble(angle) - exact)
+            for angle, exact in zip(angles, truth[:2], strict=True)
+        )
+    )
 
 
 def apart(a: State, b: State) -> float:
@@ -105,7 +130,7 @@ def apart(a: State, b: State) -> float:
     return max(abs(one.theta1 - other.theta1), abs(one.theta2 - other.theta2))
 
 
-# --- 1 ----------------------------------------------------------------------------------------------------------------
+# --- 1 --------------------------------------------------------------------------------------------
 
 
 def fallen(pendulum: Pendulum, state: State) -> object:
@@ -117,7 +142,9 @@ LITTLE = 1e-3
 
 
 def upright(quick: bool) -> Iterator[Row]:
-    """Released close to the upright state: x(t) = sum a_i cosh(rate_i t) v_i, whatever digits pi has as a double."""
+    """Released close to the upright state: x(t) = sum a_i cosh(rate_i t) v_i, whatever digits pi
+    has as a double.
+    """
     rates, modes = np.linalg.eig(np.array([[2.0, -1.0], [-2.0, 2.0]]) * 9.8 / 0.2)
     rates = np.sqrt(rates)
     for degrees in (1e-3, 1e-6, 1e-9):
@@ -130,20 +157,33 @@ def upright(quick: bool) -> Iterator[Row]:
             return np.linalg.norm(modes @ (shares * np.cosh(rates * t))) - LITTLE
 
         expected = bisected(distance, 0.0, 10.0)
-        crossing = dpend.first_crossing(fallen, PAPER, dpend.released(theta, theta), 8.0, Scheme("rk8", 1e-3))
-        # Each step rounds an angle near pi by up to half a unit in its last place, 2.2e-16 rad; those steps count that
-        # lie within 1/rate of the start.
+        crossing = dpend.first_crossing(
+            fallen, PAPER, dpend.released(theta, theta), 8.0, Scheme("rk8", 1e-3)
+        )
+        # Each step rounds an angle near pi by up to half a unit in its last place, 2.2e-16 rad;
+        # those steps count that lie within 1/rate of the start.
         rounding = 2.2e-16 / (rates.max() * 1e-3) / np.radians(degrees)
         what = f"{degrees:g} deg off upright: time to fall {LITTLE:g} rad"
-        yield near(1, what, expected, float(crossing.time), (LITTLE**2 + rounding) / rates.max(), "s", 8)
+        yield near(
+            1, what, expected, float(crossing.time), (LITTLE**2 + rounding) / rates.max(), "s", 8
+        )
         yield right_or_told(
-            1, f"{degrees:g} deg off upright, {expected + 0.7:.2f} s", [theta, theta], expected + 0.7, 1e-6
+            1,
+            f"{degrees:g} deg off upright, {expected + 0.7:.2f} s",
+            [theta, theta],
+            expected + 0.7,
+            1e-6,
         )
     motion = dpend.simulate(PAPER, dpend.released(np.pi, np.pi), 4.0, tolerance=1e-6)
-    what = "released at the double next to pi, 4 s: it never moves in doubles, and falls after 2.3 s in truth"
+    what = (
+        "released at the double next to pi, 4 s: it never moves in doubles, and falls after 2.3 "
+        "s in truth"
+    )
     yield says(1, what, "beyond_horizon", word(motion.status))
     motion = dpend.simulate(PAPER, dpend.released(0.0, 0.0), 100.0, step=1e-2)
-    yield below(1, "hanging at rest, 100 s", "stays", float(np.max(np.abs(motion.state.theta1))), 0.0, "rad")
+    yield below(
+        1, "hanging at rest, 100 s", "stays", float(np.max(np.abs(motion.state.theta1))), 0.0, "rad"
+    )
 
 
 def bisected(function: Callable[[float], float], low: float, high: float) -> float:
@@ -153,19 +193,28 @@ def bisected(function: Callable[[float], float], low: float, high: float) -> flo
     return low
 
 
-# --- 2 ----------------------------------------------------------------------------------------------------------------
+# --- 2 --------------------------------------------------------------------------------------------
 
 
 def ratios(quick: bool) -> Iterator[Row]:
     """Mass and length ratios from 1e-6 to 1e6."""
     worst = {}
     for exponent in (-2, -4, -6):
-        ours = dpend.simulate(Pendulum(m2=0.1 * 10.0**exponent), dpend.released(1.0, 0.4), 1.0, tolerance=1e-10)
+        ours = dpend.simulate(
+            Pendulum(m2=0.1 * 10.0**exponent), dpend.released(1.0, 0.4), 1.0, tolerance=1e-10
+        )
         time = np.asarray(ours.time)
         off = np.abs(np.asarray(ours.state.theta1) - simple_pendulum(1.0, np.sqrt(9.8 / 0.2), time))
         worst[exponent] = float(np.max(off))
         what = f"m2/m1 = 1e{exponent}: theta1 against a simple pendulum's, to a quarter period"
-        yield below(2, what, "elliptic function", float(np.max(off[time < 0.25])), 0.5 * 10.0**exponent, "rad")
+        yield below(
+            2,
+            what,
+            "elliptic function",
+            float(np.max(off[time < 0.25])),
+            0.5 * 10.0**exponent,
+            "rad",
+        )
     what = "theta1 off a simple pendulum's in 1 s, at m2/m1 = 1e-4 over that at 1e-6"
     yield near(2, what, 100.0, worst[-4] / worst[-6], 1.0, "")
     powers = (-6, 0, 6) if quick else (-6, -4, -2, 0, 2, 4, 6)
@@ -182,7 +231,9 @@ def simple_pendulum(theta: float, omega: float, times: np.ndarray) -> np.ndarray
 
 
 def two_integrators(mass: int, length: int, quick: bool) -> Row:
-    """Our step for a tolerance against diffrax, for half a swing, or 2000 radians of the fast mode."""
+    """Our step for a tolerance against diffrax, for half a swing, or 2000 radians of the fast
+    mode.
+    """
     pendulum = Pendulum(m2=0.1 * 10.0**mass, l2=0.2 * 10.0**length)
     start = dpend.released(1.0, 0.4)
     slow, fast = (float(mode.frequency) for mode in dpend.normal_modes(pendulum))
@@ -202,11 +253,13 @@ def like_diffrax(case: int, what: str, pendulum: Pendulum, state: State, duratio
     return below(case, what, "diffrax, 1e-13", apart(ours.state, theirs.state), bound, "rad")
 
 
-# --- 3 ----------------------------------------------------------------------------------------------------------------
+# --- 3 --------------------------------------------------------------------------------------------
 
 
 def folded(quick: bool) -> Iterator[Row]:
-    """The rods at right angles and folded back onto each other, where cos and sin of their angle vanish."""
+    """The rods at right angles and folded back onto each other, where cos and sin of their angle
+    vanish.
+    """
     for difference in (90.0, 180.0, 180.0 - 1e-6):
         for omega in (0.0, 20.0):
             theta1 = 0.7
@@ -215,31 +268,50 @@ def folded(quick: bool) -> Iterator[Row]:
             ours = dpend.simulate(PAPER, state, 0.5, tolerance=1e-10)
             truth = extended.motion(NUMBERS, (theta1, theta2, omega, -omega), [0.5])[-1]
             found = missed(ours.state, truth)
-            what = f"theta1 - theta2 = {difference:.7g} deg, turning at +-{omega:g} rad/s, 0.5 s, to 1e-10 rad"
+            what = (
+                f"theta1 - theta2 = {difference:.7g} deg, turning at +-{omega:g} rad/s, 0.5 s, "
+                f"to 1e-10 rad"
+            )
             yield below(3, what, "long double", found, 1e-10, "rad")
     long = Pendulum(l1=0.2, l2=0.2, m1=1e-4, m2=0.1)
     what = "folded, the inner bob a thousandth of the outer: 0.5 s, to 1e-9 rad"
     yield like_diffrax(3, what, long, dpend.released(2.0, 2.0 - np.pi), 0.5)
 
 
-# --- 4 ----------------------------------------------------------------------------------------------------------------
+# --- 4 --------------------------------------------------------------------------------------------
 
 
 def spinning(quick: bool) -> Iterator[Row]:
-    """Fast rods. Without gravity the angle between them obeys one equation of the first order: a quadrature."""
+    """Fast rods. Without gravity the angle between them obeys one equation of the first order: a
+    quadrature.
+    """
     free = Pendulum(g=0.0)
     for omega in (50.0, 500.0):
         state = dpend.momenta(free, 0.3, 0.1, omega, -omega)
         turn, rate = 2 * math.pi, relative_rate(free, state)
-        duration = integrate.quad(lambda x, rate=rate: 1 / rate(x), 0.0, turn, epsabs=0, epsrel=1e-12, limit=200)[0]
+        duration = integrate.quad(
+            lambda x, rate=rate: 1 / rate(x), 0.0, turn, epsabs=0, epsrel=1e-12, limit=200
+        )[0]
         ours = dpend.simulate(free, state, duration, tolerance=1e-9)
-        found = abs(float((ours.state.theta1 - ours.state.theta2)[-1] - (ours.state.theta1 - ours.state.theta2)[0]))
+        found = abs(
+            float(
+                (ours.state.theta1 - ours.state.theta2)[-1]
+                - (ours.state.theta1 - ours.state.theta2)[0]
+            )
+        )
         what = f"no gravity, {omega:g} rad/s: theta2 - theta1 after the time of one turn"
         yield near(4, what, turn, found, 2e-9, "rad", 11)
     state = dpend.momenta(PAPER, 0.3, 0.1, 500.0, -500.0)
     ours = dpend.simulate(PAPER, state, 0.2, tolerance=1e-9)
     truth = extended.motion(NUMBERS, (0.3, 0.1, 500.0, -500.0), [0.2], longest=1e-4)[-1]
-    yield below(4, "+-500 rad/s for 0.2 s, to 1e-9 rad", "long double", missed(ours.state, truth), 1e-9, "rad")
+    yield below(
+        4,
+        "+-500 rad/s for 0.2 s, to 1e-9 rad",
+        "long double",
+        missed(ours.state, truth),
+        1e-9,
+        "rad",
+    )
     for method in ("rk4", "rk8", "gauss", "rk4-circle", "rk8-circle"):
         motion = dpend.simulate(PAPER, state, 0.5, step=1e-2, method=method)
         yield says(4, f"{method}, a step of 5 rad", "step_too_large", word(motion.status))
@@ -248,16 +320,22 @@ def spinning(quick: bool) -> Iterator[Row]:
         at={"theta2": 0.1, "p1": float(state.p1), "p2": float(state.p2)}, tolerance=1e-6,
     )  # fmt: skip
     yield below(
-        4, "+-500 rad/s in a sweep for 1e-6 rad: energy drift", "conserved", float(field.energy_drift[0]), 1e-6, ""
+        4,
+        "+-500 rad/s in a sweep for 1e-6 rad: energy drift",
+        "conserved",
+        float(field.energy_drift[0]),
+        1e-6,
+        "",
     )
 
 
 def relative_rate(pendulum: Pendulum, state: State) -> Callable[[float], float]:
-    """delta' as a function of how far delta = theta2 - theta1 has come, from the two conserved quantities (g = 0).
+    """delta' as a function of how far delta = theta2 - theta1 has come, from the two conserved
+    quantities (g = 0).
 
-    With u = delta', the angular momentum L = (A + 2B cos + C) w1 + (C + B cos) u and twice the energy
-    2E = (A + 2B cos + C) w1^2 + 2 (C + B cos) w1 u + C u^2, A = (m1 + m2) l1^2, B = m2 l1 l2, C = m2 l2^2; without w1,
-    u^2 = (2E I - L^2)/(C I - (C + B cos)^2), I = A + 2B cos + C.
+    With u = delta', the angular momentum L = (A + 2B cos + C) w1 + (C + B cos) u and twice the
+    energy 2E = (A + 2B cos + C) w1^2 + 2 (C + B cos) w1 u + C u^2, A = (m1 + m2) l1^2, B = m2 l1
+    l2, C = m2 l2^2; without w1, u^2 = (2E I - L^2)/(C I - (C + B cos)^2), I = A + 2B cos + C.
     """
     l1, l2, m1, m2 = (float(getattr(pendulum, name)) for name in ("l1", "l2", "m1", "m2"))
     a, b, c = (m1 + m2) * l1**2, m2 * l1 * l2, m2 * l2**2
@@ -274,11 +352,12 @@ def relative_rate(pendulum: Pendulum, state: State) -> Callable[[float], float]:
     return rate
 
 
-# --- 5 ----------------------------------------------------------------------------------------------------------------
+# --- 5 --------------------------------------------------------------------------------------------
 
 
 def long_run(quick: bool) -> Iterator[Row]:
-    """The elliptic in-phase orbit of 20 degrees for a million periods: 120 steps a period of gauss, beside RK4.
+    """The elliptic in-phase orbit of 20 degrees for a million periods: 120 steps a period of gauss,
+    beside RK4.
 
     Not a whole number of them: where every period rounds alike, so does the sum.
     """
@@ -287,7 +366,14 @@ def long_run(quick: bool) -> Iterator[Row]:
     periods = np.arange(1, blocks + 1) * count
     worst, energy, lag = after_blocks(orbit, Scheme("gauss", step), blocks, count)
     total = f"{periods[-1]:,} periods"
-    yield below(5, f"gauss, {total}: largest energy error at any step", "conserved", float(np.max(worst)), 1e-11, "")
+    yield below(
+        5,
+        f"gauss, {total}: largest energy error at any step",
+        "conserved",
+        float(np.max(worst)),
+        1e-11,
+        "",
+    )
     yield trend(f"gauss, {total}: trend of the energy at whole periods", energy, wanted=False)
     off = np.abs(lag - periods * (periods @ lag) / (periods @ periods))
     what = f"gauss, {total}: lag behind the orbit, {lag[-1]:.2e} s in all, off proportional to time"
@@ -298,8 +384,8 @@ def long_run(quick: bool) -> Iterator[Row]:
 
 
 def trend(what: str, energy: np.ndarray, *, wanted: bool) -> Row:
-    """Whether the steps of the energy from block to block have a mean that chance does not explain: rounding makes a
-    random walk, whose steps are independent.
+    """Whether the steps of the energy from block to block have a mean that chance does not explain:
+    rounding makes a random walk, whose steps are independent.
     """
     steps = np.diff(energy, prepend=0.0)
     ratio = abs(float(np.mean(steps))) / (float(np.std(steps, ddof=1)) / math.sqrt(len(steps)))
@@ -314,9 +400,11 @@ def followed(carry: tuple, time: object, dt: object, state: State) -> tuple:
     return start, jnp.maximum(worst, jnp.abs(dpend.hamiltonian(PAPER, state) - start)), state
 
 
-def after_blocks(orbit: dpend.PeriodicOrbit, scheme: Scheme, blocks: int, count: int) -> tuple[np.ndarray, ...]:
-    """Of each of `blocks` times `count` periods the largest energy error at any step, that at its end, in units of the
-    release's energy above the bottom, and the lag there [s].
+def after_blocks(
+    orbit: dpend.PeriodicOrbit, scheme: Scheme, blocks: int, count: int
+) -> tuple[np.ndarray, ...]:
+    """Of each of `blocks` times `count` periods the largest energy error at any step, that at its
+    end, in units of the release's energy above the bottom, and the lag there [s].
     """
     bottom = dpend.hamiltonian(PAPER, dpend.released(0.0, 0.0))
     start, force = dpend.hamiltonian(PAPER, orbit.state), dpend.vector_field(PAPER, orbit.state)
@@ -333,11 +421,13 @@ def after_blocks(orbit: dpend.PeriodicOrbit, scheme: Scheme, blocks: int, count:
         # Near the rest p = (t - lag) p'(0), and the angles stand still.
         lag = -(state.p1 * force.p1 + state.p2 * force.p2) / (force.p1**2 + force.p2**2)
         error = dpend.hamiltonian(PAPER, state) - start
-        rows.append([float(value) for value in (worst / (start - bottom), error / (start - bottom), lag)])
+        rows.append(
+            [float(value) for value in (worst / (start - bottom), error / (start - bottom), lag)]
+        )
     return tuple(np.array(rows).T)
 
 
-# --- 6 ----------------------------------------------------------------------------------------------------------------
+# --- 6 --------------------------------------------------------------------------------------------
 
 
 def chaotic(quick: bool) -> Iterator[Row]:
@@ -346,7 +436,9 @@ def chaotic(quick: bool) -> Iterator[Row]:
     state = dpend.released(*start)
     durations = np.arange(1.0, 5.1 if quick else 11.1, 0.5)
     truth = extended.motion(NUMBERS, (*start, 0.0, 0.0), durations, longest=0.002)
-    found = dpend.chaos.maximal_lyapunov(PAPER, state, Scheme("rk8-circle", 4e-3), duration=200.0 if quick else 2000.0)
+    found = dpend.chaos.maximal_lyapunov(
+        PAPER, state, Scheme("rk8-circle", 4e-3), duration=200.0 if quick else 2000.0
+    )
     exponent = float(found["exponent"])
     for tolerance in (1e-3, 1e-6, 1e-9):
         believed, wrong = 0.0, 0.0
@@ -357,17 +449,30 @@ def chaotic(quick: bool) -> Iterator[Row]:
             believed = float(duration)
             wrong = max(wrong, missed(motion.state, exact))
         law = math.log(tolerance / 2.2e-16) / exponent
-        what = f"(170, 180) deg to {tolerance:g} rad: believed for {believed:g} s; ln(tol/eps)/lambda = {law:.1f} s"
+        what = (
+            f"(170, 180) deg to {tolerance:g} rad: believed for {believed:g} s; "
+            f"ln(tol/eps)/lambda = {law:.1f} s"
+        )
         yield below(6, what, "long double", wrong, tolerance, "rad")
         if not quick:
-            yield near(6, f"(170, 180) deg to {tolerance:g} rad: time believed", law, believed, 0.5 * law, "s", 3)
+            yield near(
+                6,
+                f"(170, 180) deg to {tolerance:g} rad: time believed",
+                law,
+                believed,
+                0.5 * law,
+                "s",
+                3,
+            )
 
 
-# --- 7 ----------------------------------------------------------------------------------------------------------------
+# --- 7 --------------------------------------------------------------------------------------------
 
 
 def many_turns(quick: bool) -> Iterator[Row]:
-    """A million turns away the motion is that of the reduced angles, but for what a double of 6e6 rad can hold."""
+    """A million turns away the motion is that of the reduced angles, but for what a double of 6e6
+    rad can hold.
+    """
     pi = 4 * np.arctan(np.longdouble(1))
     # A double of 6e6 rad is known to half a unit in its last place, 4.7e-10 rad.
     for turns in (1_000, 1_000_000):
@@ -377,18 +482,24 @@ def many_turns(quick: bool) -> Iterator[Row]:
             scheme = Scheme(method, 1e-3)
             a = dpend.flow(PAPER, dpend.released(*far), 1.0, scheme)
             b = dpend.flow(PAPER, dpend.released(*reduced), 1.0, scheme)
-            differences = np.longdouble([float(a.theta1), float(a.theta2)]) - 2 * pi * np.array([turns, -turns])
+            differences = np.longdouble([float(a.theta1), float(a.theta2)]) - 2 * pi * np.array(
+                [turns, -turns]
+            )
             found = float(np.abs(differences - np.array([float(b.theta1), float(b.theta2)])).max())
-            yield below(7, f"{turns:,} turns away, {method}, 1 s", "the reduced start", found, 1e-9, "rad")
+            yield below(
+                7, f"{turns:,} turns away, {method}, 1 s", "the reduced start", found, 1e-9, "rad"
+            )
     beyond = dpend.simulate(PAPER, dpend.released(1e12, 0.0), 1.0, step=1e-2)
     yield says(7, "1e12 rad, where sine is not computed", "nonfinite", word(beyond.status))
 
 
-# --- 8 ----------------------------------------------------------------------------------------------------------------
+# --- 8 --------------------------------------------------------------------------------------------
 
 
 def unstable(quick: bool) -> Iterator[Row]:
-    """Orbits whose multipliers exceed 1e10: they return as well as the digits of their release allow."""
+    """Orbits whose multipliers exceed 1e10: they return as well as the digits of their release
+    allow.
+    """
     for branch, angle in (("in-phase", 174.0), ("in-phase", 178.0), ("anti-phase", 179.9)):
         orbit = dpend.find_orbit(PAPER, np.radians(angle), branch=branch)
         period, theta1, theta2 = float(orbit.period), float(orbit.theta1), float(orbit.theta2)
@@ -397,15 +508,19 @@ def unstable(quick: bool) -> Iterator[Row]:
         found = float(np.abs(np.array(back[:2], float) - centre).max())
         # A hundred units in the last place of the release, grown to the quarter period.
         grown = 4.4e-14 * math.exp(float(orbit.log_abs_kappa) / 4)
-        what = f"{branch}, {angle:g} deg, kappa = {float(orbit.kappa):.2g}: both rods vertical at T/4"
+        what = (
+            f"{branch}, {angle:g} deg, kappa = {float(orbit.kappa):.2g}: both rods vertical at T/4"
+        )
         yield below(8, what, "long double", found, grown, "rad")
         family = dpend.follow_family(PAPER, branch).at(np.radians(angle))
         gap = abs(float(family.log_abs_kappa) - float(orbit.log_abs_kappa))
-        yield below(8, f"{branch}, {angle:g} deg: log |kappa| by segments", "in one piece", gap, 1e-6, "")
+        yield below(
+            8, f"{branch}, {angle:g} deg: log |kappa| by segments", "in one piece", gap, 1e-6, ""
+        )
         yield says(8, f"{branch}, {angle:g} deg: status", "converged", word(orbit.status))
 
 
-# --- 9 ----------------------------------------------------------------------------------------------------------------
+# --- 9 --------------------------------------------------------------------------------------------
 
 _WITHOUT_FLOAT64 = """
 import dpend
@@ -419,7 +534,9 @@ except RuntimeError as error:
 def without_float64(quick: bool) -> Iterator[Row]:
     """float64 switched off by the user, and single precision given."""
     environment = os.environ | {"JAX_ENABLE_X64": "0", "DPEND_PLAIN_JAX": "1"}
-    calls = ["dpend.flow(dpend.Pendulum(), dpend.released(1.0, 0.4), 1.0, dpend.Scheme('rk4', 1e-2))"]
+    calls = [
+        "dpend.flow(dpend.Pendulum(), dpend.released(1.0, 0.4), 1.0, dpend.Scheme('rk4', 1e-2))"
+    ]
     if not quick:
         calls += [
             "dpend.simulate(dpend.Pendulum(), dpend.released(1.0, 0.4), 1.0)",
@@ -431,15 +548,22 @@ def without_float64(quick: bool) -> Iterator[Row]:
     for call in calls:
         command = [sys.executable, "-c", _WITHOUT_FLOAT64.format(call=call)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        yield says(9, f"x64 switched off: {call.split('(')[0]}", "float64", (done.stdout + done.stderr).strip()[-200:])
+        yield says(
+            9,
+            f"x64 switched off: {call.split('(')[0]}",
+            "float64",
+            (done.stdout + done.stderr).strip()[-200:],
+        )
     single = dpend.released(np.float32(1.1), np.float32(0.4))
     double = dpend.released(float(np.float32(1.1)), float(np.float32(0.4)))
     scheme = Scheme("rk8", 5e-3)
     found = apart(dpend.flow(PAPER, single, 1.0, scheme), dpend.flow(PAPER, double, 1.0, scheme))
-    yield below(9, "a release in single precision, 1 s", "the same number as a double", found, 0.0, "rad")
+    yield below(
+        9, "a release in single precision, 1 s", "the same number as a double", found, 0.0, "rad"
+    )
 
 
-# --- 10 ---------------------------------------------------------------------------------------------------------------
+# --- 10 -------------------------------------------------------------------------------------------
 
 
 def gravity(quick: bool) -> Iterator[Row]:
@@ -447,8 +571,17 @@ def gravity(quick: bool) -> Iterator[Row]:
     up = Pendulum(g=-9.8)
     theirs = dpend.simulate(PAPER, dpend.released(1.0 + np.pi, 0.4 + np.pi), 1.0, tolerance=1e-10)
     ours = dpend.simulate(up, dpend.released(1.0, 0.4), 1.0, tolerance=1e-10)
-    turned = State(ours.state.theta1 + np.pi, ours.state.theta2 + np.pi, ours.state.p1, ours.state.p2)
-    yield below(10, "g = -9.8, 1 s, to 1e-10 rad", "g = 9.8, half a turn on", apart(turned, theirs.state), 2e-10, "rad")
+    turned = State(
+        ours.state.theta1 + np.pi, ours.state.theta2 + np.pi, ours.state.p1, ours.state.p2
+    )
+    yield below(
+        10,
+        "g = -9.8, 1 s, to 1e-10 rad",
+        "g = 9.8, half a turn on",
+        apart(turned, theirs.state),
+        2e-10,
+        "rad",
+    )
     free = Pendulum(g=0.0)
     rest = dpend.simulate(free, dpend.released(1.0, 0.4), 1.0, tolerance=1e-9)
     moved = float(jnp.max(jnp.abs(rest.state.theta1 - 1.0)))
@@ -461,28 +594,51 @@ def gravity(quick: bool) -> Iterator[Row]:
             partial(dpend.find_orbit, pendulum, 0.7, branch="in-phase"),
         )
         yield refused(
-            10, f"g = {g}: follow_family", "g must be positive", partial(dpend.follow_family, pendulum, "in-phase")
+            10,
+            f"g = {g}: follow_family",
+            "g must be positive",
+            partial(dpend.follow_family, pendulum, "in-phase"),
         )
-        yield refused(10, f"g = {g}: normal_modes", "g must be positive", partial(dpend.normal_modes, pendulum))
+        yield refused(
+            10,
+            f"g = {g}: normal_modes",
+            "g must be positive",
+            partial(dpend.normal_modes, pendulum),
+        )
         search = partial(dpend.find_brake_orbits, pendulum, theta1=0.7, max_period=1.0)
         yield refused(10, f"g = {g}: find_brake_orbits", "g must be positive", search)
     yield refused(
-        10, "g = 0: a step for a tolerance of a sweep", "g must not be zero", partial(dpend.scheme_for, free, 1e-6)
+        10,
+        "g = 0: a step for a tolerance of a sweep",
+        "g must not be zero",
+        partial(dpend.scheme_for, free, 1e-6),
     )
 
 
 CASES = {
-    1: upright, 2: ratios, 3: folded, 4: spinning, 5: long_run, 6: chaotic, 7: many_turns, 8: unstable,
-    9: without_float64, 10: gravity,
-}  # fmt: skip
+    1: upright,
+    2: ratios,
+    3: folded,
+    4: spinning,
+    5: long_run,
+    6: chaotic,
+    7: many_turns,
+    8: unstable,
+    9: without_float64,
+    10: gravity,
+}
 
 
 def page(rows: list[Row]) -> str:
     """The table for README.md."""
     lines = ["| | what | expected | found | may differ by | verdict |", "|---|---|---|---|---|---|"]
     for row in rows:
-        what, expected, found = (text.replace("|", "/") for text in (row.what, row.expected, row.found))
-        lines.append(f"| {row.case} | {what} | {expected} | {found} | {row.bound} | {row.verdict} |")
+        what, expected, found = (
+            text.replace("|", "/") for text in (row.what, row.expected, row.found)
+        )
+        lines.append(
+            f"| {row.case} | {what} | {expected} | {found} | {row.bound} | {row.verdict} |"
+        )
     return "\n".join(lines)
 
 
@@ -507,7 +663,8 @@ def main() -> None:
         if options.case in (None, number):
             for row in case(options.quick):
                 print(
-                    f"{row.case:2d}  {row.verdict:5s}  {row.what}: {row.found}  ({row.expected}, {row.bound})",
+                    f"{row.case:2d}  {row.verdict:5s}  {row.what}: {row.found}  ({row.expected}, "
+                    f"{row.bound})",
                     flush=True,
                 )
                 rows.append(row)

@@ -1,7 +1,7 @@
 """The house, measured: how long files and functions are, how they branch, and how names are used.
 
-Prints one table of the package as it is. It reads the source of the package that Python would import, and runs none of
-it.
+Prints one table of the package as it is. It reads the source of the package that Python would
+import, and runs none of it.
 
 Why we trust it: it counts what Python's own parser sees.
 """
@@ -60,7 +60,10 @@ def text_lines(node: ast.AST) -> set[int]:
     """The lines of the docstrings in a tree."""
     found: set[int] = set()
     for inner in ast.walk(node):
-        if isinstance(inner, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and inner.body:
+        if (
+            isinstance(inner, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+            and inner.body
+        ):
             first = inner.body[0]
             if (
                 isinstance(first, ast.Expr)
@@ -75,7 +78,14 @@ def code_lines(path: Path) -> tuple[set[int], set[int]]:
     """The lines that hold code, and those that hold nothing but a comment."""
     code: set[int] = set()
     comments: set[int] = set()
-    quiet = {tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING, tokenize.ENDMARKER}
+    quiet = {
+        tokenize.NL,
+        tokenize.NEWLINE,
+        tokenize.INDENT,
+        tokenize.DEDENT,
+        tokenize.ENCODING,
+        tokenize.ENDMARKER,
+    }
     with tokenize.open(path) as file:
         for token in tokenize.generate_tokens(file.readline):
             if token.type == tokenize.COMMENT:
@@ -86,7 +96,9 @@ def code_lines(path: Path) -> tuple[set[int], set[int]]:
 
 
 def complexity(node: ast.AST) -> int:
-    """One, and one for each way that branches off; functions inside count with the one that holds them."""
+    """One, and one for each way that branches off; functions inside count with the one that holds
+    them.
+    """
     count = 1
     for inner in ast.walk(node):
         if isinstance(inner, BRANCHES):
@@ -132,14 +144,20 @@ def names_of(path: Path) -> Iterator[str]:
             yield node.name
         elif isinstance(node, (ast.Assign, ast.AnnAssign)):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            yield from (inner.id for target in targets for inner in ast.walk(target) if isinstance(inner, ast.Name))
+            yield from (
+                inner.id
+                for target in targets
+                for inner in ast.walk(target)
+                if isinstance(inner, ast.Name)
+            )
 
 
 def is_participle(name: str) -> bool:
     """Whether a function's name begins or ends with a past participle."""
     words = name.strip("_").split("_")
     return any(
-        word in IRREGULAR or (word.endswith("ed") and word not in NO_PARTICIPLES) for word in (words[0], words[-1])
+        word in IRREGULAR or (word.endswith("ed") and word not in NO_PARTICIPLES)
+        for word in (words[0], words[-1])
     )
 
 
@@ -172,25 +190,37 @@ def rows() -> Iterator[tuple[str, object]]:
     worst = max(functions, key=lambda function: function.complexity)
     yield "files", len(files)
     yield "lines", sum(sizes.values())
-    yield "of them code", sum(len(code_lines(path)[0] - text_lines(ast.parse(path.read_text()))) for path in files)
+    yield (
+        "of them code",
+        sum(len(code_lines(path)[0] - text_lines(ast.parse(path.read_text()))) for path in files),
+    )
     yield "of them docstrings", sum(len(text_lines(ast.parse(path.read_text()))) for path in files)
     yield "of them comments", sum(len(code_lines(path)[1]) for path in files)
     yield "longest file", f"{max(sizes.values())} ({max(sizes, key=sizes.__getitem__)})"
     yield "files above 350 lines", sum(size > 350 for size in sizes.values())
     yield "widest line", max(len(line) for path in files for line in path.read_text().splitlines())
     yield "functions", len(functions)
-    yield "lines of a function, median / 90 % / largest", spread([function.lines for function in functions])
+    yield (
+        "lines of a function, median / 90 % / largest",
+        spread([function.lines for function in functions]),
+    )
     yield "lines of code of one", spread([function.code for function in functions])
     yield "longest function", f"{longest.code} ({longest.file}: {longest.name})"
     yield "functions above 40 lines of code", sum(function.code > 40 for function in functions)
     yield "functions above 7 parameters", sum(function.parameters > 7 for function in functions)
     yield "largest complexity", f"{worst.complexity} ({worst.file}: {worst.name})"
-    yield "functions of complexity above 12", sum(function.complexity > 12 for function in functions)
+    yield (
+        "functions of complexity above 12",
+        sum(function.complexity > 12 for function in functions),
+    )
     yield "untyped functions", sum(not function.typed for function in functions)
     yield "underscore names imported across files", sum(private_imports(path) for path in files)
     yield "names at the top of files", sum(1 for path in files for _ in names_of(path))
     yield "of them in several files", sum(len(places) > 1 for places in homes.values())
-    yield "functions named by a participle", sum(is_participle(function.name) for function in functions)
+    yield (
+        "functions named by a participle",
+        sum(is_participle(function.name) for function in functions),
+    )
 
 
 def main() -> None:

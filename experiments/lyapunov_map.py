@@ -1,10 +1,10 @@
 """The Lyapunov map of all releases from rest, with the map of its own error.
 
-Finite-time exponents over 10 s of the paper's pendulum, 1024 x 1024 cells in a resumable store; a second pass at half
-the step says for each cell whether it may be believed. Where the motion is regular the error is that of the method;
-where it is chaotic the two passes part before the end, and only the distribution of exponents means something. The
-script prints the distributions of both passes there, and compares ten regular cells with diffrax's variational
-equations.
+Finite-time exponents over 10 s of the paper's pendulum, 1024 x 1024 cells in a resumable store; a
+second pass at half the step says for each cell whether it may be believed. Where the motion is
+regular the error is that of the method; where it is chaotic the two passes part before the end, and
+only the distribution of exponents means something. The script prints the distributions of both
+passes there, and compares ten regular cells with diffrax's variational equations.
 """
 
 import argparse
@@ -34,16 +34,24 @@ def by_diffrax(pendulum: dpend.Pendulum, theta1: float, theta2: float) -> float:
 
     tangent = size.vector(*chaos.GENERIC)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(slope), diffrax.Dopri8(), 0.0, DURATION, 1e-3, (dpend.released(theta1, theta2), tangent),
-        stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-14), max_steps=100_000,
-    )  # fmt: skip
+        diffrax.ODETerm(slope),
+        diffrax.Dopri8(),
+        0.0,
+        DURATION,
+        1e-3,
+        (dpend.released(theta1, theta2), tangent),
+        stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-14),
+        max_steps=100_000,
+    )
     end = jax.tree.map(lambda leaf: leaf[0], solution.ys[1])
     return float(0.5 * np.log(size.square(end)) / DURATION)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a coarse map, written nowhere but to --out")
+    parser.add_argument(
+        "--quick", action="store_true", help="a coarse map, written nowhere but to --out"
+    )
     parser.add_argument("--out", type=Path, default=HERE / "lyapunov_map.zarr")
     parser.add_argument("--figure", type=Path, default=HERE / "figures" / "lyapunov_map.png")
     options = parser.parse_args()
@@ -58,7 +66,10 @@ def main() -> None:
     print(f"{cells} x {cells} cells in {time.perf_counter() - started:.0f} s")
     exponent, error = field.lyapunov.values, field.lyapunov_error.values
     believed = error < 1e-3
-    print(f"{np.mean(believed):.1%} of the cells keep their exponent to 1e-3/s when the step is halved")
+    print(
+        f"{np.mean(believed):.1%} of the cells keep their exponent to 1e-3/s when the step is "
+        f"halved"
+    )
     quantiles = np.quantile(exponent[~believed], [0.1, 0.5, 0.9])
     print(f"exponents of the others, 10, 50 and 90 %: {quantiles.round(3)} 1/s")
     picked = np.flatnonzero((error < 1e-6).ravel())

@@ -1,11 +1,13 @@
-"""How far the error estimates of `simulate` and `reference` are from the errors: random motions against heyoka.
+"""How far the error estimates of `simulate` and `reference` are from the errors: random motions
+against heyoka.
 
-Two samples: releases from rest on the whole square of the paper's pendulum, over 2 and 5 s to 1e-3 ... 1e-12 rad; and
-pendulums whose lengths and masses differ by up to a thousand, half of them in motion at the start, over up to four
-slow periods to 1e-3 ... 1e-11 rad. The truth is heyoka's Taylor method in long double, on Lagrange's equations. Prints
-a table for each: how many motions passed, how many of them were wrong, how many were refused, how many of those were
-right, and quantiles of estimate over error. `--quick` takes a few motions. Exits with 1 if a passed motion is off by
-more than twice its tolerance, or if more than one in 200 is off at all.
+Two samples: releases from rest on the whole square of the paper's pendulum, over 2 and 5 s to 1e-3
+... 1e-12 rad; and pendulums whose lengths and masses differ by up to a thousand, half of them in
+motion at the start, over up to four slow periods to 1e-3 ... 1e-11 rad. The truth is heyoka's
+Taylor method in long double, on Lagrange's equations. Prints a table for each: how many motions
+passed, how many of them were wrong, how many were refused, how many of those were right, and
+quantiles of estimate over error. `--quick` takes a few motions. Exits with 1 if a passed motion is
+off by more than twice its tolerance, or if more than one in 200 is off at all.
 """
 
 import argparse
@@ -51,13 +53,17 @@ def on_the_square(random: np.random.Generator) -> Iterator[Motion]:
     """Releases of the paper's pendulum from rest."""
     while True:
         duration, tolerance = random.choice([2.0, 5.0]), 10.0 ** random.integers(-12, -2)
-        yield Motion(Pendulum(), dpend.released(*random.uniform(-np.pi, np.pi, 2)), duration, tolerance)
+        yield Motion(
+            Pendulum(), dpend.released(*random.uniform(-np.pi, np.pi, 2)), duration, tolerance
+        )
 
 
 def of_other_pendulums(random: np.random.Generator) -> Iterator[Motion]:
     """Lengths and masses as different as a thousand to one."""
     while True:
-        pendulum = Pendulum(0.2, 0.2 * 10 ** random.uniform(-3, 3), 0.1, 0.1 * 10 ** random.uniform(-3, 3))
+        pendulum = Pendulum(
+            0.2, 0.2 * 10 ** random.uniform(-3, 3), 0.1, 0.1 * 10 ** random.uniform(-3, 3)
+        )
         slow, fast = (float(mode.frequency) for mode in dpend.normal_modes(pendulum))
         rates = 2 * slow * random.normal(size=2) * random.integers(2)
         state = dpend.momenta(pendulum, *random.uniform(-np.pi, np.pi, 2), *rates)
@@ -94,13 +100,19 @@ def truth(taylor: heyoka.taylor_adaptive, motion: Motion, times: np.ndarray) -> 
 
 def judge(taylor: heyoka.taylor_adaptive, motion: Motion) -> Verdict:
     """`simulate` against the truth, at the worst of the times looked at."""
-    ours = dpend.simulate(motion.pendulum, motion.state, motion.duration, tolerance=motion.tolerance)
+    ours = dpend.simulate(
+        motion.pendulum, motion.state, motion.duration, tolerance=motion.tolerance
+    )
     last = ours.time.size - 1
     rows = np.unique(np.linspace(1, last, min(_LOOKS, last)).astype(int))
     exact = truth(taylor, motion, np.asarray(ours.time)[rows])
-    found = np.stack([np.asarray(ours.state.theta1)[rows], np.asarray(ours.state.theta2)[rows]], axis=1)
+    found = np.stack(
+        [np.asarray(ours.state.theta1)[rows], np.asarray(ours.state.theta2)[rows]], axis=1
+    )
     error = float(np.max(np.abs(found - exact)))
-    return Verdict(motion.tolerance, int(ours.status) == Status.CONVERGED, float(ours.error_estimate), error)
+    return Verdict(
+        motion.tolerance, int(ours.status) == Status.CONVERGED, float(ours.error_estimate), error
+    )
 
 
 def print_row(name: str, verdicts: list[Verdict]) -> None:

@@ -1,14 +1,17 @@
-"""Are the error estimates of orbits larger than their errors? Random pendulums, solved again in long double.
+"""Are the error estimates of orbits larger than their errors? Random pendulums, solved again in
+long double.
 
     python experiments/orbit_errors.py [--quick]
 
-Pendulums with l2/l1 and m2/m1 from 0.01 to 100 (log-uniform), their in-phase and anti-phase families, and orbits of
-each by every call that tells an error: points of `follow_family`, `Family.at`, `find_orbit` by branch, by guess (as
-centred and as brake orbits) and by ratio. Release angles cover each family, a third of them close to its largest angle.
-The truth is Newton's method in long double, the pendulum's and the release's doubles taken for the numbers that they
-are: Lagrange's equations by heyoka's Taylor series, and the Jacobian by differences of the same. Nothing of it is
-dpend's. Left out are orbits that long double cannot hold either: where its last update is above 1e-14, or kappa above
-1e52. Prints the quantiles of estimate over error and how many errors are above ten times their estimate: none may be.
+Pendulums with l2/l1 and m2/m1 from 0.01 to 100 (log-uniform), their in-phase and anti-phase
+families, and orbits of each by every call that tells an error: points of `follow_family`,
+`Family.at`, `find_orbit` by branch, by guess (as centred and as brake orbits) and by ratio. Release
+angles cover each family, a third of them close to its largest angle. The truth is Newton's method
+in long double, the pendulum's and the release's doubles taken for the numbers that they are:
+Lagrange's equations by heyoka's Taylor series, and the Jacobian by differences of the same. Nothing
+of it is dpend's. Left out are orbits that long double cannot hold either: where its last update is
+above 1e-14, or kappa above 1e52. Prints the quantiles of estimate over error and how many errors
+are above ten times their estimate: none may be.
 """
 
 import argparse
@@ -24,7 +27,8 @@ from dpend import Pendulum, Status
 FIELDS = ("l1", "l2", "m1", "m2", "g")
 _L = np.longdouble
 _PI = _L("3.14159265358979323846264338327950288")
-# What is known of the truth: the last update of Newton's method, relative, and the growth that long double outlives.
+# What is known of the truth: the last update of Newton's method, relative, and the growth that long
+# double outlives.
 _CONVERGED, _TOO_UNSTABLE = 1e-14, 1e52
 _QUANTILES = (0.0, 0.01, 0.1, 0.5, 0.9, 1.0)
 
@@ -53,16 +57,27 @@ class Truth:
         return self.integrator.state.copy()
 
     def orbit(self, orbit, ratio=None):
-        """The unknown angle and the period of the orbit next to this one, and Newton's last update (relative)."""
+        """The unknown angle and the period of the orbit next to this one, and Newton's last update
+        (relative).
+        """
         pendulum = [_L(float(getattr(orbit.pendulum, name))) for name in FIELDS]
         part = 4 if orbit.symmetry == "centred" else 2
         rows = slice(0, 2) if part == 4 else slice(2, 4)
-        goal = _PI * np.array([int(turn) for turn in orbit.turns], _L) if part == 4 else np.zeros(2, _L)
-        theta1, x, duration = (_L(float(v)) for v in (orbit.theta1, orbit.theta2, orbit.period / part))
+        goal = (
+            _PI * np.array([int(turn) for turn in orbit.turns], _L)
+            if part == 4
+            else np.zeros(2, _L)
+        )
+        theta1, x, duration = (
+            _L(float(v)) for v in (orbit.theta1, orbit.theta2, orbit.period / part)
+        )
         x = theta1 if ratio else x
         unit = min(_L(1), max(abs(theta1), abs(x)))
         # Differences that the growth over the arc leaves small, and long double can resolve.
-        nudge = max(_L(2) ** -32 / max(_L(1), abs(_L(float(orbit.kappa)))) ** _L(0.25), _L(2) ** -54) * unit
+        nudge = (
+            max(_L(2) ** -32 / max(_L(1), abs(_L(float(orbit.kappa)))) ** _L(0.25), _L(2) ** -54)
+            * unit
+        )
 
         def release(x):
             return (x, ratio * x) if ratio else (theta1, x)
@@ -81,17 +96,23 @@ class Truth:
 def random_pendulum(rng):
     """Lengths and masses of 0.1 to 2 times powers of ten from -2 to 2."""
     length, mass = rng.uniform(0.1, 2.0, 2)
-    return Pendulum(length, length * 10 ** rng.uniform(-2, 2), mass, mass * 10 ** rng.uniform(-2, 2), 9.8)
+    return Pendulum(
+        length, length * 10 ** rng.uniform(-2, 2), mass, mass * 10 ** rng.uniform(-2, 2), 9.8
+    )
 
 
 def orbits_of(pendulum, branch, rng, most_points, long_ways):
-    """(kind, orbit, ratio) of orbits on one family; with `long_ways` those that walk there anew, too."""
+    """(kind, orbit, ratio) of orbits on one family; with `long_ways` those that walk there anew,
+    too.
+    """
     family = dpend.follow_family(pendulum, branch, most_points=most_points)
     angles = np.abs(np.asarray(family.orbits.theta1))
     for i in [*rng.choice(len(angles), min(len(angles), 6), replace=False), len(angles) - 1]:
         yield "follow_family", pick(family.orbits, i), None
     reach = angles.max()
-    wanted = np.append(reach * rng.uniform(1e-3, 1.0, 4), reach * (1 - 10 ** rng.uniform(-8, -2, 2)))
+    wanted = np.append(
+        reach * rng.uniform(1e-3, 1.0, 4), reach * (1 - 10 ** rng.uniform(-8, -2, 2))
+    )
     there = family.at(wanted)
     for i, theta1 in enumerate(wanted):
         orbit = pick(there, i)
@@ -103,7 +124,9 @@ def orbits_of(pendulum, branch, rng, most_points, long_ways):
                 yield f"find_orbit(guess), {symmetry}", found, None
     if long_ways:
         yield "find_orbit(branch)", dpend.find_orbit(pendulum, wanted[0], branch=branch), None
-    if long_ways and family.status == Status.CONVERGED:  # to the end, which of some pendulums takes thousands of points
+    if (
+        long_ways and family.status == Status.CONVERGED
+    ):  # to the end, which of some pendulums takes thousands of points
         ratio = 1 if branch == "in-phase" else -1
         yield "find_orbit(ratio)", dpend.find_orbit(pendulum, 0.5 * reach, ratio=ratio), ratio
 
@@ -116,8 +139,16 @@ def pick(orbits, i):
 
 
 def measure(pendulums, seed=0, most_points=150, seconds=np.inf):
-    """Rows (kind, error and estimate of the angle [rad], of the period [s], kappa), and how many were left out."""
-    rng, truth, rows, left_out, begun = np.random.default_rng(seed), Truth(), [], 0, time.perf_counter()
+    """Rows (kind, error and estimate of the angle [rad], of the period [s], kappa), and how many
+    were left out.
+    """
+    rng, truth, rows, left_out, begun = (
+        np.random.default_rng(seed),
+        Truth(),
+        [],
+        0,
+        time.perf_counter(),
+    )
     for i in range(pendulums):
         if time.perf_counter() - begun > seconds:
             print(f"stopped after {i} of {pendulums} pendulums")
@@ -132,7 +163,15 @@ def measure(pendulums, seed=0, most_points=150, seconds=np.inf):
                 continue
             known = orbit.theta1 if ratio else orbit.theta2
             errors = abs(float(x - _L(float(known)))), abs(float(period - _L(float(orbit.period))))
-            rows.append((kind, *errors, *(float(e) for e in orbit.error_estimate), float(orbit.kappa), pendulum))
+            rows.append(
+                (
+                    kind,
+                    *errors,
+                    *(float(e) for e in orbit.error_estimate),
+                    float(orbit.kappa),
+                    pendulum,
+                )
+            )
     return rows, left_out
 
 
@@ -148,9 +187,18 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=np.inf, help="stop after so long")
     arguments = parser.parse_args()
-    rows, left_out = measure(30 if arguments.quick else 1000, arguments.seed, seconds=arguments.seconds)
-    print(f"{len(rows)} orbits, {left_out} left out: long double does not hold them. Estimate over error:")
-    print(f"{'':32} orbits " + "".join(f"{f'{100 * q:g} %':>10}" for q in _QUANTILES) + "  error > 10 estimates")
+    rows, left_out = measure(
+        30 if arguments.quick else 1000, arguments.seed, seconds=arguments.seconds
+    )
+    print(
+        f"{len(rows)} orbits, {left_out} left out: long double does not hold them. Estimate over "
+        f"error:"
+    )
+    print(
+        f"{'':32} orbits "
+        + "".join(f"{f'{100 * q:g} %':>10}" for q in _QUANTILES)
+        + "  error > 10 estimates"
+    )
     for kind in sorted({row[0] for row in rows}):
         some = [row for row in rows if row[0] == kind]
         for name, ratios in zip(("angle", "period"), ratios_of(some).T, strict=True):

@@ -1,8 +1,9 @@
 """The paper, reproduced: its figures 1 to 49, and a table of every number printed in it.
 
-Iwao Yamaguchi, "On the periodical behavior of a double pendulum" (in Japanese). Each figure stands twice, as printed on
-the left and true on the right (paper_numbers.py says what that means), in figures/paper/ as PNG and, in the paper's
-order with captions, in paper.pdf there. The numbers go to paper_claims.csv. `--quick` draws five figures, for tests.
+Iwao Yamaguchi, "On the periodical behavior of a double pendulum" (in Japanese). Each figure stands
+twice, as printed on the left and true on the right (paper_numbers.py says what that means), in
+figures/paper/ as PNG and, in the paper's order with captions, in paper.pdf there. The numbers go to
+paper_claims.csv. `--quick` draws five figures, for tests.
 """
 
 import argparse
@@ -43,9 +44,13 @@ from dpend.plots import LOWER, NEUTRAL, UPPER
 
 HERE = Path(__file__).parent
 STYLE = {
-    "font.size": 9, "axes.titlesize": 9, "axes.spines.top": False, "axes.spines.right": False, "lines.linewidth": 1.0,
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.0,
     "savefig.dpi": 110,
-}  # fmt: skip
+}
 NAMES = {
     "theta1": "theta1 (rad)", "theta2": "theta2 (rad)",
     "kinetic1": "kinetic energy of bob 1 (J)", "potential1": "potential energy of bob 1 (J)",
@@ -61,16 +66,25 @@ class Plan(NamedTuple):
     draw: Callable
 
 
-# --- one panel -------------------------------------------------------------------------------------------------------
+# --- one panel ------------------------------------------------------------------------------------
 
 
 def path(name: str, points: bool = False) -> Callable:
-    """theta1 to the right, theta2 upwards; over one period, or in figure 2 every tenth step of 3 s, joined."""
+    """theta1 to the right, theta2 upwards; over one period, or in figure 2 every tenth step of 3 s,
+    joined.
+    """
 
     def draw(ax, mode):
         motion = motion_of(name, mode)
         part = motion.until(2.9905).every(0.01) if points else motion.until(period(name, mode))
-        ax.plot(part.theta1, part.theta2, ".-" if points else "-", color=NEUTRAL, markersize=2, linewidth=0.7)
+        ax.plot(
+            part.theta1,
+            part.theta2,
+            ".-" if points else "-",
+            color=NEUTRAL,
+            markersize=2,
+            linewidth=0.7,
+        )
         ax.plot(part.theta1[0], part.theta2[0], "o", color="black", markersize=4)
         ax.set(xlabel=NAMES["theta1"], ylabel=NAMES["theta2"])
 
@@ -78,7 +92,9 @@ def path(name: str, points: bool = False) -> Callable:
 
 
 def phase(name: str, bob: int) -> Callable:
-    """Kinetic energy to the right, potential energy upwards, a point each ms: of 3 s, from B on of a period."""
+    """Kinetic energy to the right, potential energy upwards, a point each ms: of 3 s, from B on of
+    a period.
+    """
 
     def draw(ax, mode):
         motion = motion_of(name, mode)
@@ -104,7 +120,9 @@ def curve(name: str, value: str) -> Callable:
 
 
 def strobe(name: str, step: float, share: float = 0.5, bobs: tuple = (1, 2)) -> Callable:
-    """The rods every `step` seconds over a share of the period; with bob 2 alone, its way without the rods."""
+    """The rods every `step` seconds over a share of the period; with bob 2 alone, its way without
+    the rods.
+    """
 
     def draw(ax, mode):
         part = motion_of(name, mode).until(share * period(name, mode)).every(step)
@@ -122,7 +140,9 @@ def _rods(ax, motion: Motion, bobs: tuple = (1, 2), width: float = 0.8) -> None:
     x1, y1, x2, y2 = (np.asarray(value) for value in dpend.positions(PAPER, state))
     still = np.zeros_like(x1)
     if 1 in bobs:
-        ax.plot(np.stack([still, x1]), np.stack([still, y1]), color=UPPER, linewidth=width, alpha=0.6)
+        ax.plot(
+            np.stack([still, x1]), np.stack([still, y1]), color=UPPER, linewidth=width, alpha=0.6
+        )
         ax.plot(np.stack([x1, x2]), np.stack([y1, y2]), color=LOWER, linewidth=width, alpha=0.6)
         ax.plot(x1, y1, "o", color=UPPER, markersize=3)
     ax.plot(x2, y2, "o", color=LOWER, markersize=3)
@@ -140,7 +160,13 @@ def chaotic_path(ax, mode) -> None:
     motion = chaos_of(mode)
     ax.plot(motion.theta1, motion.theta2, color=NEUTRAL, linewidth=0.7)
     ax.plot(motion.theta1[0], motion.theta2[0], "o", color="black", markersize=4)
-    ax.plot(motion.at("theta1", parting_time()), motion.at("theta2", parting_time()), "x", color=LOWER, markersize=7)
+    ax.plot(
+        motion.at("theta1", parting_time()),
+        motion.at("theta2", parting_time()),
+        "x",
+        color=LOWER,
+        markersize=7,
+    )
     ax.set(xlabel=NAMES["theta1"], ylabel=NAMES["theta2"])
 
 
@@ -150,13 +176,26 @@ def chaotic_curve(value: str) -> Callable:
     def draw(ax, mode):
         other = chaos_of(MODES[1 - MODES.index(mode)])
         motion = chaos_of(mode)
-        ax.plot(other.time, getattr(other, value), color="0.75", label=f"{MODES[1 - MODES.index(mode)]}")
+        ax.plot(
+            other.time, getattr(other, value), color="0.75", label=f"{MODES[1 - MODES.index(mode)]}"
+        )
         ax.plot(motion.time, getattr(motion, value), color=_colour(int(value[-1])), label=mode)
-        ax.axvline(parting_time(), color="black", linewidth=0.7, linestyle=":", label="0.1 rad apart")
+        ax.axvline(
+            parting_time(), color="black", linewidth=0.7, linestyle=":", label="0.1 rad apart"
+        )
         if value.startswith("potential"):
-            times = upper_somersaults(motion) if value == "potential1" else lower_somersaults(motion)
+            times = (
+                upper_somersaults(motion) if value == "potential1" else lower_somersaults(motion)
+            )
             heights = np.interp(times, motion.time, getattr(motion, value))
-            ax.plot(times, heights, "v", color="black", markersize=5, label="somersaults, as the paper counts them")
+            ax.plot(
+                times,
+                heights,
+                "v",
+                color="black",
+                markersize=5,
+                label="somersaults, as the paper counts them",
+            )
         ax.set(xlabel="time (s)", ylabel=NAMES[value])
         ax.margins(y=0.22)
         ax.legend(frameon=False, fontsize=7, ncols=2, loc="upper left", columnspacing=1.0)
@@ -171,7 +210,9 @@ def chaotic_separation(ax, mode) -> None:
         (rough_slope(time, logs), "-", "rough, through t = 0"),
         (float(time @ logs / (time @ time)), "--", "least squares, through t = 0"),
     ):
-        ax.semilogy(time, start * np.exp(slope * time), style, color=LOWER, label=f"{label}: {slope:.2f}/s")
+        ax.semilogy(
+            time, start * np.exp(slope * time), style, color=LOWER, label=f"{label}: {slope:.2f}/s"
+        )
     ax.set(xlabel="time (s)", ylabel="separation (rad and SI momenta)")
     ax.legend(frameon=False, fontsize=8)
 
@@ -207,7 +248,7 @@ def sketch(ax, mode) -> None:
     ax.axis("off")
 
 
-# --- all of them -----------------------------------------------------------------------------------------------------
+# --- all of them ----------------------------------------------------------------------------------
 
 
 def plans() -> list[Plan]:
@@ -219,7 +260,10 @@ def plans() -> list[Plan]:
         Plan(4, "A: energies of bob 2", phase("A", 2)),
     ]
     values = [f"{kind}{bob}" for bob in (1, 2) for kind in ("theta", "kinetic", "potential")]
-    found += [Plan(5 + i, f"A: {_said(value)} over one period", curve("A", value)) for i, value in enumerate(values)]
+    found += [
+        Plan(5 + i, f"A: {_said(value)} over one period", curve("A", value))
+        for i, value in enumerate(values)
+    ]
     found += [Plan(11, "A: every 0.03 s of half a period", strobe("A", 0.03))]
     for first, name in ((12, "B"), (18, "C"), (24, "D"), (31, "E"), (37, "F")):
         step = CASES[name].strobe
@@ -232,11 +276,24 @@ def plans() -> list[Plan]:
             Plan(first + 5, f"{name}: every {step} s of half a period", strobe(name, step)),
         ]
         if name == "D":
-            found.append(Plan(30, "D: bob 2 every 0.015 s of a quarter period", strobe("D", 0.015, 0.25, (2,))))
-    found.append(Plan(43, f"Chaotic: path over 5 s; the cross marks t = {parting_time():.2f} s, where both modes part",
-                      chaotic_path))  # fmt: skip
+            found.append(
+                Plan(
+                    30, "D: bob 2 every 0.015 s of a quarter period", strobe("D", 0.015, 0.25, (2,))
+                )
+            )
+    found.append(
+        Plan(
+            43,
+            f"Chaotic: path over 5 s; the cross marks t = {parting_time():.2f} s, where both modes "
+            f"part",
+            chaotic_path,
+        )
+    )
     chaotic = ("theta1", "theta2", "potential1", "potential2")
-    found += [Plan(44 + i, f"Chaotic: {_said(key)} over 5 s", chaotic_curve(key)) for i, key in enumerate(chaotic)]
+    found += [
+        Plan(44 + i, f"Chaotic: {_said(key)} over 5 s", chaotic_curve(key))
+        for i, key in enumerate(chaotic)
+    ]
     found += [Plan(48, "Chaotic: separation from a release 1e-6 deg away", chaotic_separation),
               Plan(49, "Chaotic: every 0.01 s of 5 s", chaotic_strobe)]  # fmt: skip
     return found
@@ -267,14 +324,21 @@ def _subtitle(plan: Plan, mode: str) -> str:
     if mode == "as printed":
         return f"as printed: ({theta1}, {CASES[name].theta2}) deg by 3.14, RK4"
     orbit = orbit_of(name, mode)
-    return f"true: ({theta1}, {float(orbit.theta2) / DEGREE['true']:.4f}) deg, T = {float(orbit.period):.4f} s"
+    theta2 = float(orbit.theta2) / DEGREE["true"]
+    return f"true: ({theta1}, {theta2:.4f}) deg, T = {float(orbit.period):.4f} s"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="five figures instead of 49")
-    parser.add_argument("--out", type=Path, default=HERE / "figures" / "paper", help="where the figures go")
-    parser.add_argument("--claims", type=Path, default=HERE / "paper_claims.csv", help="where the table goes")
+    parser.add_argument(
+        "--out", type=Path, default=HERE / "figures" / "paper", help="where the figures go"
+    )
+    parser.add_argument(
+        "--claims", type=Path, default=HERE / "paper_claims.csv", help="where the table goes"
+    )
     options = parser.parse_args()
     started = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -285,10 +349,15 @@ def main() -> None:
             figure.savefig(options.out / f"figure_{plan.number:02d}.png")
             book.savefig(figure)
             plt.close(figure)
-    print(f"{len(wanted)} figures in {options.out}, all in paper.pdf there, {time.perf_counter() - started:.0f} s")
+    print(
+        f"{len(wanted)} figures in {options.out}, all in paper.pdf there, "
+        f"{time.perf_counter() - started:.0f} s"
+    )
     found = write_claims(options.claims)
     verdicts = [claim.verdict.partition(":")[0] for claim in found]
-    counts = ", ".join(f"{verdicts.count(verdict)} {verdict}" for verdict in (CONFIRMED, ONLY_PRINTED, DIFFERS))
+    counts = ", ".join(
+        f"{verdicts.count(verdict)} {verdict}" for verdict in (CONFIRMED, ONLY_PRINTED, DIFFERS)
+    )
     print(f"{len(found)} claims: {counts}; {time.perf_counter() - started:.0f} s in all")
 
 

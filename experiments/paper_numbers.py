@@ -1,9 +1,11 @@
-"""The numbers of the paper: its motions computed twice, and every printed value beside ours with a verdict.
+"""The numbers of the paper: its motions computed twice, and every printed value beside ours with a
+verdict.
 
-Iwao Yamaguchi, "On the periodical behavior of a double pendulum" (in Japanese): point masses on massless rods,
-l = 0.2 m, m = 0.1 kg, g = 9.8 m/s^2, RK4 with a step of 1 ms, six periodic motions A to F and a chaotic one.
-`as printed`: the printed angles, degrees times 3.14/180 as the paper's program has it, RK4 at 1 ms. `true`: pi, order 8
-at 1 ms, the partner angle solved for. Run by paper.py.
+Iwao Yamaguchi, "On the periodical behavior of a double pendulum" (in Japanese): point masses on
+massless rods, l = 0.2 m, m = 0.1 kg, g = 9.8 m/s^2, RK4 with a step of 1 ms, six periodic motions A
+to F and a chaotic one. `as printed`: the printed angles, degrees times 3.14/180 as the paper's
+program has it, RK4 at 1 ms. `true`: pi, order 8 at 1 ms, the partner angle solved for. Run by
+paper.py.
 """
 
 import csv
@@ -28,11 +30,13 @@ STEP = 1e-3
 RUNS = (("as printed",), ("true",), ("true", 2))
 
 
-# --- motions ---------------------------------------------------------------------------------------------------------
+# --- motions --------------------------------------------------------------------------------------
 
 
 class Case(NamedTuple):
-    """A periodic motion of the paper: printed release [deg] and period [s], and its strobe's step [s]."""
+    """A periodic motion of the paper: printed release [deg] and period [s], and its strobe's step
+    [s].
+    """
 
     theta1: str
     theta2: str
@@ -52,7 +56,9 @@ CASES = {
 
 
 class Motion(NamedTuple):
-    """A sampled motion, NumPy arrays: times [s], angles [rad], angular velocities [rad/s], energies of the bobs [J]."""
+    """A sampled motion, NumPy arrays: times [s], angles [rad], angular velocities [rad/s], energies
+    of the bobs [J].
+    """
 
     time: np.ndarray
     theta1: np.ndarray
@@ -84,8 +90,13 @@ def motion_from(theta1: float, theta2: float, duration: float, mode: str, finer:
     """The motion from a release [rad]; `finer` divides the step."""
     method = "rk4" if mode == "as printed" else "rk8"
     found = dpend.simulate(
-        PAPER, dpend.released(theta1, theta2), duration, step=STEP / finer, method=method, error=False,
-    )  # fmt: skip
+        PAPER,
+        dpend.released(theta1, theta2),
+        duration,
+        step=STEP / finer,
+        method=method,
+        error=False,
+    )
     omega = dpend.velocities(PAPER, found.state)
     state = found.state
     arrays = (found.time, state.theta1, state.theta2, *omega, state.p1, state.p2, *_bobs(state))
@@ -99,9 +110,13 @@ def _bobs(state: dpend.State) -> tuple:
 
 @cache
 def orbit_of(name: str, mode: str, finer: int = 1) -> dpend.PeriodicOrbit:
-    """The periodic orbit released at the case's first angle, in that mode's degrees; `finer` divides the step."""
+    """The periodic orbit released at the case's first angle, in that mode's degrees; `finer`
+    divides the step.
+    """
     case = CASES[name]
-    return dpend.find_orbit(PAPER, float(case.theta1) * DEGREE[mode], branch=case.branch, turn=0.1 / finer)
+    return dpend.find_orbit(
+        PAPER, float(case.theta1) * DEGREE[mode], branch=case.branch, turn=0.1 / finer
+    )
 
 
 @cache
@@ -133,7 +148,7 @@ def parting_time() -> float:
     return float(a.time[np.argmax(gap > 0.1)])
 
 
-# --- what is read off a motion ---------------------------------------------------------------------------------------
+# --- what is read off a motion --------------------------------------------------------------------
 
 
 def crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -159,10 +174,12 @@ def greatest(values: np.ndarray) -> float:
 
 
 def bound(value: float, finer: float) -> float:
-    """The error of a value read off samples, told by the same at half the sampling step: twice the change.
+    """The error of a value read off samples, told by the same at half the sampling step: twice the
+    change.
 
-    A straight line between samples is off by s (1 - s) in units that fall fourfold with half the step, s being where
-    in its interval the instant lies. What half the step leaves is then at most half of it, whatever s.
+    A straight line between samples is off by s (1 - s) in units that fall fourfold with half the
+    step, s being where in its interval the instant lies. What half the step leaves is then at most
+    half of it, whatever s.
     """
     return 2 * abs(finer - value)
 
@@ -183,15 +200,21 @@ def first_peak(motion: Motion, bob: int) -> float:
 
 
 def return_time(motion: Motion) -> float:
-    """When the upper rod, released, comes to rest for the second time [s]: the period, where the motion comes back."""
+    """When the upper rod, released, comes to rest for the second time [s]: the period, where the
+    motion comes back.
+    """
     return float(crossings(motion.time, motion.omega1)[1])
 
 
 def bend(motion: Motion) -> float:
-    """How far the path in the two angles, up to the first rest, lies from a straight line through its ends [deg]."""
+    """How far the path in the two angles, up to the first rest, lies from a straight line through
+    its ends [deg].
+    """
     end = rest(motion, 1)
     part = motion.until(end)
-    chord = np.array([motion.at("theta1", end) - part.theta1[0], motion.at("theta2", end) - part.theta2[0]])
+    chord = np.array(
+        [motion.at("theta1", end) - part.theta1[0], motion.at("theta2", end) - part.theta2[0]]
+    )
     away = chord[0] * (part.theta2 - part.theta2[0]) - chord[1] * (part.theta1 - part.theta1[0])
     return math.degrees(greatest(np.abs(away)) / np.hypot(*chord))
 
@@ -217,27 +240,37 @@ def lower_somersaults(motion: Motion) -> np.ndarray:
 
 
 def separation(mode: str, finer: int = 1) -> tuple[np.ndarray, np.ndarray, float]:
-    """Times [s], ln(d/d(0)) and d(0) of the paper's separation: the norm of the differences, angles and SI momenta."""
+    """Times [s], ln(d/d(0)) and d(0) of the paper's separation: the norm of the differences, angles
+    and SI momenta.
+    """
     a, b = (chaos_of(mode, finer, apart).until(4.0) for apart in (0.0, 1e-6))
-    d = np.sqrt(sum((getattr(a, key) - getattr(b, key)) ** 2 for key in ("theta1", "theta2", "p1", "p2")))
+    d = np.sqrt(
+        sum((getattr(a, key) - getattr(b, key)) ** 2 for key in ("theta1", "theta2", "p1", "p2"))
+    )
     return a.time, np.log(d / d[0]), float(d[0])
 
 
 def rough_slope(time: np.ndarray, logs: np.ndarray) -> float:
-    """A line drawn by eye from the point at t = 0: the median slope to the points of the second half."""
+    """A line drawn by eye from the point at t = 0: the median slope to the points of the second
+    half.
+    """
     late = time > 0.5 * time[-1]
     return float(np.median(logs[late] / time[late]))
 
 
 @cache
 def running_exponent() -> tuple[np.ndarray, np.ndarray, dict]:
-    """Times, the running exponent of the chaotic motion, and the converged one with its uncertainty [1/s]."""
+    """Times, the running exponent of the chaotic motion, and the converged one with its uncertainty
+    [1/s].
+    """
     state = dpend.released(170 * DEGREE["true"], 180 * DEGREE["true"])
     scheme = dpend.scheme_for(PAPER, 1e-6)
     size, seconds = dpend.chaos.norm(PAPER), 10_000
 
     def second(carry, _):  # type: ignore[no-untyped-def]
-        (end, tangent) = dpend.fold(_last, carry[0], PAPER, carry[0], 1.0, scheme, tangents=carry[1])
+        (end, tangent) = dpend.fold(
+            _last, carry[0], PAPER, carry[0], 1.0, scheme, tangents=carry[1]
+        )
         length = jax.numpy.sqrt(size.square(tangent))
         return (end, jax.tree.map(lambda x: x / length, tangent)), jax.numpy.log(length)
 
@@ -245,14 +278,18 @@ def running_exponent() -> tuple[np.ndarray, np.ndarray, dict]:
     _, logs = jax.lax.scan(second, start, None, length=seconds)
     time = np.arange(1, seconds + 1.0)
     converged = dpend.chaos.maximal_lyapunov(PAPER, state, scheme, duration=float(seconds))
-    return time, np.cumsum(np.asarray(logs)) / time, {key: float(value) for key, value in converged.items()}
+    return (
+        time,
+        np.cumsum(np.asarray(logs)) / time,
+        {key: float(value) for key, value in converged.items()},
+    )
 
 
 def _last(carry, time, dt, state, tangent):  # type: ignore[no-untyped-def]
     return state, tangent
 
 
-# --- the printed numbers ---------------------------------------------------------------------------------------------
+# --- the printed numbers --------------------------------------------------------------------------
 
 CONFIRMED, ONLY_PRINTED, DIFFERS = "confirmed", "confirmed as printed only", "differs"
 
@@ -261,8 +298,8 @@ CONFIRMED, ONLY_PRINTED, DIFFERS = "confirmed", "confirmed as printed only", "di
 class Claim:
     """A printed number beside ours.
 
-    `error` bounds the true one and `rounding` is how far processors may differ in both; zero for counts. `verdict`
-    begins with one of the three words.
+    `error` bounds the true one and `rounding` is how far processors may differ in both; zero for
+    counts. `verdict` begins with one of the three words.
     """
 
     section: str
@@ -276,12 +313,12 @@ class Claim:
     rounding: float = 0.0
 
 
-# How far two processors may differ in a number, by its unit: a thousand times what they were seen to (with and without
-# AVX-512, and the options of XLA that dpend sets). No error bound is less.
+# How far two processors may differ in a number, by its unit: a thousand times what they were seen
+# to (with and without AVX-512, and the options of XLA that dpend sets). No error bound is less.
 ROUNDING = {"deg": 1e-10, "rad": 1e-12, "s": 1e-12, "J": 1e-12, "rad/s": 1e-12, "": 1e-10}
-# The same where a motion magnifies rounding: over eight periods of the unstable D (its miss was seen to differ by 1e-9
-# degrees), over 5 s of the chaotic one (somersaults 2e-11 s, the logarithms of distances of 1e-8 rad 2e-6/s), and over
-# 10 000 s of it, where an exponent is one of many.
+# The same where a motion magnifies rounding: over eight periods of the unstable D (its miss was
+# seen to differ by 1e-9 degrees), over 5 s of the chaotic one (somersaults 2e-11 s, the logarithms
+# of distances of 1e-8 rad 2e-6/s), and over 10 000 s of it, where an exponent is one of many.
 _UNSTABLE, _CHAOTIC, _PARTING, _LONG = 1e-7, 1e-8, 1e-4, 0.1
 
 
@@ -292,16 +329,26 @@ def rounds_to(value: float, printed: str) -> bool:
 
 
 def judged(printed: str, as_printed: float, true: float, reason: str) -> str:
-    """The verdict on a printed number by its own digits, with what it would have to be, and `reason`."""
+    """The verdict on a printed number by its own digits, with what it would have to be, and
+    `reason`.
+    """
     both = rounds_to(as_printed, printed), rounds_to(true, printed)
     if all(both):
         return CONFIRMED
     decimals = len(printed.partition(".")[2])
 
     def told(value: float) -> str:
-        return f"{value:.{decimals + 2}f} rounds to {value:.{decimals}f}" if decimals else f"there are {value:g}"
+        return (
+            f"{value:.{decimals + 2}f} rounds to {value:.{decimals}f}"
+            if decimals
+            else f"there are {value:g}"
+        )
 
-    said = f"made with 3.14 it is another, {told(as_printed)}; with pi, {told(true)}" if both[1] else told(true)
+    said = (
+        f"made with 3.14 it is another, {told(as_printed)}; with pi, {told(true)}"
+        if both[1]
+        else told(true)
+    )
     return f"{ONLY_PRINTED if both[0] else DIFFERS}: {said}" + (f"; {reason}" if reason else "")
 
 
@@ -311,12 +358,26 @@ class Table:
     def __init__(self) -> None:
         self.claims: list[Claim] = []
 
-    def number(self, section, quantity, printed, as_printed, true, error, unit="", reason="", rounding=None):  # type: ignore[no-untyped-def]
+    def number(
+        self, section, quantity, printed, as_printed, true, error, unit="", reason="", rounding=None
+    ):  # type: ignore[no-untyped-def]
         """A printed number, judged by its own digits."""
         verdict = judged(printed, as_printed, true, reason)
         self._add(section, quantity, printed, as_printed, true, error, unit, verdict, rounding)
 
-    def statement(self, section, quantity, printed, as_printed, true, error, unit, holds, reason="", rounding=None):  # type: ignore[no-untyped-def]
+    def statement(
+        self,
+        section,
+        quantity,
+        printed,
+        as_printed,
+        true,
+        error,
+        unit,
+        holds,
+        reason="",
+        rounding=None,
+    ):  # type: ignore[no-untyped-def]
         """Something said in words, judged by a measure of it: `holds`, or not and why."""
         verdict = CONFIRMED if holds else f"{DIFFERS}: {reason}"
         self._add(section, quantity, printed, as_printed, true, error, unit, verdict, rounding)
@@ -325,13 +386,18 @@ class Table:
         if rounding is None:
             rounding = 0.0 if isinstance(true, int) else ROUNDING.get(unit, ROUNDING[""])
         error = round_up(max(error, rounding))
-        self.claims.append(Claim(section, quantity, printed, as_printed, true, error, unit, verdict, rounding))
+        self.claims.append(
+            Claim(section, quantity, printed, as_printed, true, error, unit, verdict, rounding)
+        )
 
     def read(self, section, quantity, printed, name, value, unit="", reason=""):  # type: ignore[no-untyped-def]
-        """A number that `value` reads off the motion of a case; its error, by half the sampling step."""
+        """A number that `value` reads off the motion of a case; its error, by half the sampling
+        step.
+        """
         # Angles are read in radians, and told in the degrees of their mode.
         as_printed, true, finer = (
-            value(motion_of(name, *which)) / (DEGREE[which[0]] if unit == "deg" else 1.0) for which in RUNS
+            value(motion_of(name, *which)) / (DEGREE[which[0]] if unit == "deg" else 1.0)
+            for which in RUNS
         )
         self.number(section, quantity, printed, as_printed, true, bound(true, finer), unit, reason)
 
@@ -351,7 +417,8 @@ def claims() -> list[Claim]:
 
 _WHY_PARTNER = {
     "C": "14.1 is 10 sqrt 2 of the linear theory",
-    "D": f"63.95 of its degrees are {63.95 * 3.14 / math.pi:.4f} true ones, and there theta2 = -theta1 comes back",
+    "D": f"63.95 of its degrees are {63.95 * 3.14 / math.pi:.4f} true ones, and there theta2 = "
+    f"-theta1 comes back",
 }
 _WHY_PERIOD = {"A": "1.25 is cut off, not rounded", "C": "1.17 is the linear theory's, or cut off",
                "F": "0.49 is the linear theory's"}  # fmt: skip
@@ -362,27 +429,37 @@ def releases_and_periods(table: Table) -> None:
     on_line = dpend.find_orbit(dpend.Pendulum(1.0, 1.0, 1.0, 1.0), math.radians(63.3), ratio=1)
     angle = math.degrees(on_line.theta1)
     table.number(
-        "4", "Schwalbe and Wagon (l = 1 m, m = 1 kg): theta1 = theta2", "63.3", angle * math.pi / 3.14, angle,
-        math.degrees(on_line.error_estimate[0]), "deg", "the angle depends on neither length nor mass",
+        "4", "Schwalbe and Wagon (l = 1 m, m = 1 kg): theta1 = "
+             "theta2", "63.3", angle * math.pi / 3.14, angle,
+        math.degrees(on_line.error_estimate[0]), "deg", "the angle depends on neither length nor "
+                                                        "mass",
     )  # fmt: skip
     for name, case in CASES.items():
         orbits = {mode: orbit_of(name, mode) for mode in MODES}
         partner = {mode: float(orbit.theta2) / DEGREE[mode] for mode, orbit in orbits.items()}
         angle_error, period_error = orbits["true"].error_estimate
         table.number(
-            name, f"theta2 that belongs to theta1 = {case.theta1} deg", case.theta2, *partner.values(),
+            name, f"theta2 that belongs to theta1 = {case.theta1} "
+                  f"deg", case.theta2, *partner.values(),
             math.degrees(angle_error), "deg", _WHY_PARTNER.get(name, ""),
         )  # fmt: skip
         period = return_time(motion_of(name, "as printed"))
         table.number(
-            name, "period", case.period, period, float(orbits["true"].period), float(period_error), "s",
+            name,
+            "period",
+            case.period,
+            period,
+            float(orbits["true"].period),
+            float(period_error),
+            "s",
             _WHY_PERIOD.get(name, ""),
-        )  # fmt: skip
+        )
     for name, ratio, printed in (("A", 1, "64.3"), ("D", -1, "63.95")):
         found = dpend.find_orbit(PAPER, math.radians(64), ratio=ratio)
         angle = math.degrees(found.theta1)
         table.number(
-            name, f"release with theta2 = {'-' if ratio < 0 else ''}theta1", printed, angle * math.pi / 3.14, angle,
+            name, f"release with theta2 = "
+                  f"{'-' if ratio < 0 else ''}theta1", printed, angle * math.pi / 3.14, angle,
             math.degrees(found.error_estimate[0]), "deg", _WHY_PARTNER.get(name, ""),
         )  # fmt: skip
     for name, printed in (("A", "1.12"), ("D", "1.116")):
@@ -401,8 +478,12 @@ def case_a(table: Table) -> None:
     """Energies, partial times and stages of A."""
     motion = motion_of("A", "true")
     when = float(crossings(motion.time, motion.potential1 - 0.032)[0])
-    angles = ", ".join(f"{math.degrees(motion.at(name, when)):.1f}" for name in ("theta1", "theta2"))
-    again = f"the printed triple is not one instant: 0.032 J belongs to {when:.3f} s, ({angles}) deg"
+    angles = ", ".join(
+        f"{math.degrees(motion.at(name, when)):.1f}" for name in ("theta1", "theta2")
+    )
+    again = (
+        f"the printed triple is not one instant: 0.032 J belongs to {when:.3f} s, ({angles}) deg"
+    )
 
     def there(name: str) -> Callable[[Motion], float]:
         return lambda motion: motion.at(name, first_peak(motion, 1))
@@ -423,13 +504,24 @@ def case_a(table: Table) -> None:
     read("PE2 at the bottom", "0", value=below("potential2"), unit="J")
     read("time of KE1's peak", "0.17", value=lambda m: first_peak(m, 1), unit="s")
     read("time of the bottom, KE1 = 0.013 J", "0.31", value=lambda m: bottom(m, 1), unit="s")
-    read("time of KE1's second peak", "0.45", value=lambda m: float(peaks(m.time, m.kinetic1)[1]), unit="s")
+    read(
+        "time of KE1's second peak",
+        "0.45",
+        value=lambda m: float(peaks(m.time, m.kinetic1)[1]),
+        unit="s",
+    )
     read("time of the rest, KE1 = 0", "0.63", value=lambda m: rest(m, 1), unit="s")
     why = "at KE1's peak, where the upper rod starts to brake"
-    read("theta1 between the first two stages", "31.5", value=there("theta1"), unit="deg", reason=why)
-    read("theta2 between the first two stages", "57.3", value=there("theta2"), unit="deg", reason=why)
+    read(
+        "theta1 between the first two stages", "31.5", value=there("theta1"), unit="deg", reason=why
+    )
+    read(
+        "theta2 between the first two stages", "57.3", value=there("theta2"), unit="deg", reason=why
+    )
     read("theta1 between the first two stages", "0.55", value=there("theta1"), unit="rad")
-    read("theta2 between the first two stages", "1.00", value=there("theta2"), unit="rad", reason=why)
+    read(
+        "theta2 between the first two stages", "1.00", value=there("theta2"), unit="rad", reason=why
+    )
 
     def later(name: str) -> Callable[[Motion], float]:
         return lambda motion: motion.at(name, float(peaks(motion.time, motion.kinetic1)[1]))
@@ -470,22 +562,33 @@ def case_d(table: Table) -> None:
 
 
 def missed(theta1: float, theta2: float, period: float, count: int, finer: int = 1) -> float:
-    """How far a release [rad] is from where it was after `count` periods; the larger angle [deg]."""
-    end = dpend.flow(PAPER, dpend.released(theta1, theta2), count * period, dpend.Scheme("rk8", 2 * STEP / finer))
+    """How far a release [rad] is from where it was after `count` periods; the larger angle
+    [deg].
+    """
+    end = dpend.flow(
+        PAPER, dpend.released(theta1, theta2), count * period, dpend.Scheme("rk8", 2 * STEP / finer)
+    )
     return math.degrees(max(abs(float(end.theta1) - theta1), abs(float(end.theta2) - theta2)))
 
 
 def what_is_said(table: Table) -> None:
     """Statements in words about A to F."""
 
-    def measured(measure: Callable[[Motion], float], names: str, pick: Callable = max) -> tuple[float, float, float]:
-        """What is picked of a measure over some cases, as printed and true, and the latter's error."""
-        as_printed, true, finer = (pick(measure(motion_of(name, *which)) for name in names) for which in RUNS)
+    def measured(
+        measure: Callable[[Motion], float], names: str, pick: Callable = max
+    ) -> tuple[float, float, float]:
+        """What is picked of a measure over some cases, as printed and true, and the latter's
+        error.
+        """
+        as_printed, true, finer = (
+            pick(measure(motion_of(name, *which)) for name in names) for which in RUNS
+        )
         return as_printed, true, bound(true, finer)
 
     apart = measured(together, "ABCDEF")
     table.statement(
-        "4", "angles hang, and rest, at the same time: worst miss of A to F", "together", *apart, "s", apart[1] < 1e-5,
+        "4", "angles hang, and rest, at the same time: worst miss of A to "
+             "F", "together", *apart, "s", apart[1] < 1e-5,
     )  # fmt: skip
     for names, upper in (("AB", True), ("DEF", False)):
         first, second = (1, 2) if upper else (2, 1)
@@ -497,28 +600,43 @@ def what_is_said(table: Table) -> None:
             rises[1] < 1e-5,
         )  # fmt: skip
         table.statement(
-            "4", f"{kind}: bob {first} peaks before it; the least lead", "> 0", *leads, "s", leads[1] > 0.01
+            "4",
+            f"{kind}: bob {first} peaks before it; the least lead",
+            "> 0",
+            *leads,
+            "s",
+            leads[1] > 0.01,
         )
     both = measured(lambda motion: max(abs(early(motion, bob)) for bob in (1, 2)), "C")
-    table.statement("C", "both bobs speed up to the bottom; their peaks' lead", "0", *both, "s", both[1] < 1e-5)
+    table.statement(
+        "C", "both bobs speed up to the bottom; their peaks' lead", "0", *both, "s", both[1] < 1e-5
+    )
     for name, printed, holds, reason in (
-        ("C", "straight", lambda bend: bend < 0.05, "it bends by a hundredth of its length, less than the eye sees"),
+        (
+            "C",
+            "straight",
+            lambda bend: bend < 0.05,
+            "it bends by a hundredth of its length, less than the eye sees",
+        ),
         ("E", "straight to the eye, strictly not", lambda bend: 0.01 < bend < 1, ""),
         ("F", "as E", lambda bend: 0.001 < bend < 1, ""),
     ):
         bends = measured(bend, name)
-        table.statement(name, "the path's distance from a straight line", printed, *bends, "deg", holds(bends[1]),
+        table.statement(name, "the path's distance from a straight "
+                              "line", printed, *bends, "deg", holds(bends[1]),
                         reason)  # fmt: skip
     angles = (1, 5, 20, 40, 60, 90, 120, 150, 170, 175)
     found = [
         sum(
-            int(dpend.find_orbit(PAPER, angle * DEGREE[mode], branch=branch).status) == dpend.Status.CONVERGED
+            int(dpend.find_orbit(PAPER, angle * DEGREE[mode], branch=branch).status)
+            == dpend.Status.CONVERGED
             for branch in ("in-phase", "anti-phase")
             for angle in angles
         )
         for mode in MODES
     ]
-    table.statement("4", f"such pairs exist from small to large angles: of {2 * len(angles)} tried, 1 to 175 deg",
+    table.statement("4", f"such pairs exist from small to large angles: of {2 * len(angles)} "
+                         f"tried, 1 to 175 deg",
                     "all", *found, 0.0, "", found[1] == 2 * len(angles))  # fmt: skip
     stability(table)
 
@@ -529,37 +647,82 @@ def stability(table: Table) -> None:
         as_printed, true, finer = (float(orbit_of(name, *which).kappa) for which in RUNS)
         multiplier = true + math.sqrt(max(true**2 - 1, 0.0))
         table.statement(
-            name, "stability index kappa: stable between -1 and 1", "a periodic motion", as_printed, true,
-            bound(true, finer), "", abs(true) < 1, f"unstable: what is off grows {multiplier:.1f} times a period",
+            name, "stability index kappa: stable between -1 and 1", "a periodic "
+                                                                    "motion", as_printed, true,
+            bound(true, finer), "", abs(true) < 1, f"unstable: what is off grows {multiplier:.1f} "
+                                                   f"times a period",
         )  # fmt: skip
     for count in (3, 5, 8):
         as_printed, true, finer = (
-            missed(63.95 * DEGREE[mode], -63.95 * DEGREE[mode], float(orbit_of("D", mode).period), count, *finer)
+            missed(
+                63.95 * DEGREE[mode],
+                -63.95 * DEGREE[mode],
+                float(orbit_of("D", mode).period),
+                count,
+                *finer,
+            )
             for mode, *finer in RUNS
         )
         table.statement(
-            "D", f"released at (63.95, -63.95) deg: miss after {count} periods", "comes back", as_printed, true,
-            bound(true, finer), "deg", true < 0.1, "0.03 true degrees off an unstable motion", _UNSTABLE,
-        )  # fmt: skip
+            "D",
+            f"released at (63.95, -63.95) deg: miss after {count} periods",
+            "comes back",
+            as_printed,
+            true,
+            bound(true, finer),
+            "deg",
+            true < 0.1,
+            "0.03 true degrees off an unstable motion",
+            _UNSTABLE,
+        )
 
 
 def linear_theory(table: Table) -> None:
     """Its equations 6 to 9, and what C and F take from them."""
-    for mode, name, omega, period in zip(dpend.normal_modes(PAPER), "CF", ("5.36", "12.93"), ("1.17", "0.49"),
-                                         strict=True):  # fmt: skip
-        table.number(name, "linear theory: omega", omega, *2 * [float(mode.frequency)], 1e-14, "rad/s")
-        table.number(name, "linear theory: period", period, *2 * [2 * math.pi / float(mode.frequency)], 1e-14, "s")
+    for mode, name, omega, period in zip(
+        dpend.normal_modes(PAPER), "CF", ("5.36", "12.93"), ("1.17", "0.49"), strict=True
+    ):
+        table.number(
+            name, "linear theory: omega", omega, *2 * [float(mode.frequency)], 1e-14, "rad/s"
+        )
+        table.number(
+            name,
+            "linear theory: period",
+            period,
+            *2 * [2 * math.pi / float(mode.frequency)],
+            1e-14,
+            "s",
+        )
         sign = 1 if name == "C" else -1
         ratio = float(mode.ratio)
-        table.statement(name, "linear theory: c = theta2/theta1", f"{sign * math.sqrt(2):.6f}", ratio, ratio, 1e-14, "",
-                        abs(ratio - sign * math.sqrt(2)) < 1e-12)  # fmt: skip
+        table.statement(
+            name,
+            "linear theory: c = theta2/theta1",
+            f"{sign * math.sqrt(2):.6f}",
+            ratio,
+            ratio,
+            1e-14,
+            "",
+            abs(ratio - sign * math.sqrt(2)) < 1e-12,
+        )
 
 
 def chaotic_motion(table: Table) -> None:
     """Section 5."""
     for angle, printed in ((170, "2.97"), (180, "3.14")):
-        table.number("5", f"release, {angle} deg", printed, *(angle * DEGREE[mode] for mode in MODES), 0.0, "rad")
-    moves = {"as printed": chaos_of("as printed"), "true": chaos_of("true"), "finer": chaos_of("true", 2)}
+        table.number(
+            "5",
+            f"release, {angle} deg",
+            printed,
+            *(angle * DEGREE[mode] for mode in MODES),
+            0.0,
+            "rad",
+        )
+    moves = {
+        "as printed": chaos_of("as printed"),
+        "true": chaos_of("true"),
+        "finer": chaos_of("true", 2),
+    }
     other = "the motions have parted: the paper's is made with 3.14 for pi"
     for bob, times, printed in (
         (1, upper_somersaults, ("1.56", "3.98")),
@@ -567,23 +730,39 @@ def chaotic_motion(table: Table) -> None:
     ):
         found = {mode: times(motion) for mode, motion in moves.items()}
         counts = [found[mode].size for mode in MODES]
-        table.number("5", f"somersaults of bob {bob} in 5 s", str(len(printed)), *counts, 0.0, "", other)
+        table.number(
+            "5", f"somersaults of bob {bob} in 5 s", str(len(printed)), *counts, 0.0, "", other
+        )
         for index, text in enumerate(printed):
-            as_printed, true, finer = (found[mode][index] for mode in ("as printed", "true", "finer"))
+            as_printed, true, finer = (
+                found[mode][index] for mode in ("as printed", "true", "finer")
+            )
             table.number(
-                "5", f"bob {bob}, somersault {index + 1}", text, as_printed, true, bound(true, finer), "s", other,
+                "5", f"bob {bob}, somersault "
+                     f"{index + 1}", text, as_printed, true, bound(true, finer), "s", other,
                 _CHAOTIC,
             )  # fmt: skip
-    total = [upper_somersaults(moves[mode]).size + lower_somersaults(moves[mode]).size for mode in MODES]
+    total = [
+        upper_somersaults(moves[mode]).size + lower_somersaults(moves[mode]).size for mode in MODES
+    ]
     table.number("5", "somersaults of both bobs in 5 s", "9", *total, 0.0, "", other)
     as_printed, true, finer = (greatest(motion.potential1) for motion in moves.values())
-    table.number("5", "greatest PE1, at bob 1's somersaults", "0.39", as_printed, true, bound(true, finer), "J",
+    table.number("5", "greatest PE1, at bob 1's "
+                      "somersaults", "0.39", as_printed, true, bound(true, finer), "J",
                  rounding=_CHAOTIC)  # fmt: skip
     exponents(table)
     parted = parting_time()
-    table.statement("5", "an angle as printed is 0.1 rad from the true one", "5 s of motion", parted, parted, STEP, "s",
-                    False,
-                    "all that is printed of later times belongs to the motion made with 3.14")  # fmt: skip
+    table.statement(
+        "5",
+        "an angle as printed is 0.1 rad from the true one",
+        "5 s of motion",
+        parted,
+        parted,
+        STEP,
+        "s",
+        False,
+        "all that is printed of later times belongs to the motion made with 3.14",
+    )
 
 
 def exponents(table: Table) -> None:
@@ -604,10 +783,20 @@ def exponents(table: Table) -> None:
     for name, fit in fits.items():
         slopes = [fit(*logs[mode]) for mode in MODES]
         finer = fit(*separation("true", 2)[:2])
-        table.number("5", f"lambda, {name}", "2.9", *slopes, bound(slopes[1], finer), "1/s", why, _PARTING)
-    table.statement("5", "lambda, converged", "2.9", *2 * [converged["exponent"]], converged["uncertainty"], "1/s",
-                    False, f"it is {said}; the running exponent stays within 10 % of it from {settled} s on",
-                    _LONG)  # fmt: skip
+        table.number(
+            "5", f"lambda, {name}", "2.9", *slopes, bound(slopes[1], finer), "1/s", why, _PARTING
+        )
+    table.statement(
+        "5",
+        "lambda, converged",
+        "2.9",
+        *2 * [converged["exponent"]],
+        converged["uncertainty"],
+        "1/s",
+        False,
+        f"it is {said}; the running exponent stays within 10 % of it from {settled} s on",
+        _LONG,
+    )
 
 
 def misprints(table: Table) -> None:
@@ -619,31 +808,44 @@ def misprints(table: Table) -> None:
     ratio = float(faster.period / slower.period)
     error = ratio * sum(float(orbit.error_estimate[1] / orbit.period) for orbit in (slower, faster))
     table.statement(
-        "listing", "gravity without the factor l: period of B over the one with it", "1", ratio, ratio, error, "",
+        "listing", "gravity without the factor l: period of B over the one with "
+                   "it", "1", ratio, ratio, error, "",
         False, "misprint: run as listed, periods are shorter by sqrt 5",
     )  # fmt: skip
     drifts = [energy_drift_of_field(sign) for sign in (1.0, -1.0)]
     error = bound(drifts[1], energy_drift_of_field(-1.0, 1e-11))
     table.statement(
-        "2", "second momentum equation without its minus sign before F: energy drift of B in 1 s", "0", *drifts, error,
-        "of the energy at release", False, "misprint: the listing has the sign, and with it the energy stays",
+        "2", "second momentum equation without its minus sign before F: energy drift of B in 1 "
+             "s", "0", *drifts, error,
+        "of the energy at release", False, "misprint: the listing has the sign, and with it the "
+                                           "energy stays",
     )  # fmt: skip
 
 
 def energy_drift_of_field(sign: float, tolerance: float = 1e-10) -> float:
-    """|H - H(0)|/|H_release - H_bottom| after 1 s of B, the force in p2' = sign F - ... taken as printed or right."""
+    """|H - H(0)|/|H_release - H_bottom| after 1 s of B, the force in p2' = sign F - ... taken as
+    printed or right.
+    """
     import diffrax
 
     def slope(time, state, args):  # type: ignore[no-untyped-def]
         right = dpend.vector_field(PAPER, state)
         weight = PAPER.m2 * PAPER.g * PAPER.l2 * jax.numpy.sin(state.theta2)
-        return dpend.State(right.theta1, right.theta2, right.p1, -sign * (right.p2 + weight) - weight)
+        return dpend.State(
+            right.theta1, right.theta2, right.p1, -sign * (right.p2 + weight) - weight
+        )
 
     start = dpend.released(math.radians(40), math.radians(49.1))
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(slope), diffrax.Dopri8(), 0.0, 1.0, 1e-3, start,
-        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=0.01 * tolerance), max_steps=100_000,
-    )  # fmt: skip
+        diffrax.ODETerm(slope),
+        diffrax.Dopri8(),
+        0.0,
+        1.0,
+        1e-3,
+        start,
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=0.01 * tolerance),
+        max_steps=100_000,
+    )
     end = jax.tree.map(lambda leaf: leaf[0], solution.ys)
     scale = dpend.hamiltonian(PAPER, start) - dpend.hamiltonian(PAPER, dpend.released(0.0, 0.0))
     return float(abs(dpend.hamiltonian(PAPER, end) - dpend.hamiltonian(PAPER, start)) / scale)
@@ -657,7 +859,17 @@ def write_claims(path: Path) -> list[Claim]:
         rows = csv.writer(file)
         rows.writerow("section quantity printed as_printed true error_bound unit verdict".split())
         for c in found:
-            rows.writerow([c.section, c.quantity, c.printed, show(c.as_printed, c.rounding), show(c.true, c.error),
-                           f"{c.error:g}", c.unit, c.verdict])  # fmt: skip
+            rows.writerow(
+                [
+                    c.section,
+                    c.quantity,
+                    c.printed,
+                    show(c.as_printed, c.rounding),
+                    show(c.true, c.error),
+                    f"{c.error:g}",
+                    c.unit,
+                    c.verdict,
+                ]
+            )
     draft.replace(path)
     return found

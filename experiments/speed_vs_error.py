@@ -1,14 +1,16 @@
-"""Speed against error: every method here beside what people would use instead, on the same motions in one run.
+"""Speed against error: every method here beside what people would use instead, on the same motions
+in one run.
 
-Three workloads: single trajectories one after the other, many easy ones, and the hard grid of all releases from rest.
-Jobs take turns, warm, as many threads as cores; the table has medians with the range of the turns, the first call
-(which compiles, and runs once) in its own column, and the peak memory of a process that does nothing else. Errors are
-the larger angle's at the end: against heyoka's Taylor series in long double on 256 lanes drawn at random, and against
-our own finest run on all. A second measurement follows the energy through 10 000 s.
+Three workloads: single trajectories one after the other, many easy ones, and the hard grid of all
+releases from rest. Jobs take turns, warm, as many threads as cores; the table has medians with the
+range of the turns, the first call (which compiles, and runs once) in its own column, and the peak
+memory of a process that does nothing else. Errors are the larger angle's at the end: against
+heyoka's Taylor series in long double on 256 lanes drawn at random, and against our own finest run
+on all. A second measurement follows the energy through 10 000 s.
 
-Writes `speed_vs_error.csv`, `energy_error.csv`, the figure and, from the first file alone, README.md's table; peers
-that are not installed are left out by name. `--quick` runs a few lanes and writes nothing, `--table` writes only the
-README's table.
+Writes `speed_vs_error.csv`, `energy_error.csv`, the figure and, from the first file alone,
+README.md's table; peers that are not installed are left out by name. `--quick` runs a few lanes and
+writes nothing, `--table` writes only the README's table.
 """
 
 import argparse
@@ -33,7 +35,9 @@ SINGLE, EASY, HARD = "one trajectory, 10 s", "16384 easy lanes, 1 s", "hard grid
 
 @dataclass(frozen=True)
 class Row:
-    """A method at one setting on one workload; errors in rad, rates in trajectory-seconds per second."""
+    """A method at one setting on one workload; errors in rad, rates in trajectory-seconds per
+    second.
+    """
 
     workload: str
     method: str
@@ -51,12 +55,14 @@ class Row:
     error_worst_all_lanes: float
 
 
-# --- motions ----------------------------------------------------------------------------------------------------------
+# --- motions --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """Releases from rest for a time [s], in the order in which a sweep deals them to lanes: by energy."""
+    """Releases from rest for a time [s], in the order in which a sweep deals them to lanes: by
+    energy.
+    """
 
     name: str
     theta1: np.ndarray
@@ -116,7 +122,9 @@ def our_singles(work: Workload, quick: bool) -> Jobs:
     states = [dpend.released(*pair) for pair in zip(work.theta1, work.theta2, strict=True)]
 
     def stepped(name, step):
-        run = jax.jit(lambda state: dpend.flow(pendulum, state, work.duration, dpend.Scheme(name, step)))
+        run = jax.jit(
+            lambda state: dpend.flow(pendulum, state, work.duration, dpend.Scheme(name, step))
+        )
 
         def once():
             ends = [run(state) for state in states]
@@ -126,8 +134,13 @@ def our_singles(work: Workload, quick: bool) -> Jobs:
 
     def simulated(tolerance):
         def once():
-            motions = [dpend.simulate(pendulum, state, work.duration, tolerance=tolerance) for state in states]
-            return np.array([(motion.state.theta1[-1], motion.state.theta2[-1]) for motion in motions]).T
+            motions = [
+                dpend.simulate(pendulum, state, work.duration, tolerance=tolerance)
+                for state in states
+            ]
+            return np.array(
+                [(motion.state.theta1[-1], motion.state.theta2[-1]) for motion in motions]
+            ).T
 
         return once
 
@@ -135,13 +148,22 @@ def our_singles(work: Workload, quick: bool) -> Jobs:
         "rk4": (4e-3, 1e-3, 2.5e-4), "rk4-circle": (4e-3, 1e-3, 2.5e-4), "rk8": (2e-2, 1e-2, 5e-3),
         "rk8-circle": (2e-2, 1e-2, 5e-3), "gauss": (1e-2, 5e-3, 2.5e-3),
     }  # fmt: skip
-    jobs = {(name, step): stepped(name, step) for name, each in steps.items() for step in each[: 1 if quick else None]}
-    jobs |= {("dpend.simulate", each): simulated(each) for each in ((1e-6,) if quick else (1e-3, 1e-6, 1e-9))}
+    jobs = {
+        (name, step): stepped(name, step)
+        for name, each in steps.items()
+        for step in each[: 1 if quick else None]
+    }
+    jobs |= {
+        ("dpend.simulate", each): simulated(each)
+        for each in ((1e-6,) if quick else (1e-3, 1e-6, 1e-9))
+    }
     return {key: (job, every) for key, job in jobs.items()}
 
 
 def jobs_of(work: Workload, quick: bool, only: str | None = None) -> Jobs:
-    """All methods on a workload, or only one; slow ones run a share of the lanes, drawn at random."""
+    """All methods on a workload, or only one; slow ones run a share of the lanes, drawn at
+    random.
+    """
     import dpend
 
     lanes = work.theta1.size
@@ -158,7 +180,9 @@ def jobs_of(work: Workload, quick: bool, only: str | None = None) -> Jobs:
 
     if work.name == SINGLE:
         jobs |= our_singles(work, quick)
-        add("numba", peers.numba_kernels, (4e-3, 1e-3, 2.5e-4), lanes)  # the C kernels take eight at a time
+        add(
+            "numba", peers.numba_kernels, (4e-3, 1e-3, 2.5e-4), lanes
+        )  # the C kernels take eight at a time
         add("heyoka", peers.heyoka_singles, (1e-4, 1e-6, 1e-9, 1e-12, 1e-15), lanes)
         add("diffrax", peers.diffrax_vmapped, (1e-5, 1e-8, 1e-11), lanes)
         add("scipy", peers.scipy_one_by_one, (1e-5, 1e-8, 1e-11), lanes)
@@ -171,26 +195,36 @@ def jobs_of(work: Workload, quick: bool, only: str | None = None) -> Jobs:
         "rk8-circle": (1e-2, 5e-3),
         "gauss": (1e-2,),
     }
-    schemes = {(name, step): dpend.Scheme(name, step) for name, each in steps.items() for step in each[few]}
+    schemes = {
+        (name, step): dpend.Scheme(name, step) for name, each in steps.items() for step in each[few]
+    }
     tolerances = (1e-3, 1e-6, 1e-8, 1e-10, 1e-11)[few]
-    schemes |= {("dpend, for a tolerance", each): dpend.scheme_for(pendulum, each) for each in tolerances}
+    schemes |= {
+        ("dpend, for a tolerance", each): dpend.scheme_for(pendulum, each) for each in tolerances
+    }
     jobs |= our_lanes(work, schemes)
     add("C, ", peers.c_kernels, (4e-3, 1e-3), lanes)
     add("numba", peers.numba_kernels, (1e-3,), lanes)
-    add("heyoka", peers.heyoka_batches, (1e-6, 3e-7, 1e-7, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13, 1e-15), lanes)
+    add(
+        "heyoka",
+        peers.heyoka_batches,
+        (1e-6, 3e-7, 1e-7, 1e-9, 1e-10, 1e-11, 1e-12, 1e-13, 1e-15),
+        lanes,
+    )
     add("diffrax", peers.diffrax_vmapped, (1e-4, 1e-8, 1e-11), 2048)
     add("scipy", peers.scipy_one_by_one, (1e-6,), 64)
     return jobs
 
 
-# --- measurements -----------------------------------------------------------------------------------------------------
+# --- measurements ---------------------------------------------------------------------------------
 
 
 def timed(jobs: Jobs, repeats: int) -> dict:
-    """First call, and median, least and most seconds of the calls after it, in turn so that all see the same machine.
+    """First call, and median, least and most seconds of the calls after it, in turn so that all see
+    the same machine.
 
-    A short job is repeated within its turn until a quarter of a second has passed: a script that sweeps finds its
-    threads awake and its memory mapped.
+    A short job is repeated within its turn until a quarter of a second has passed: a script that
+    sweeps finds its threads awake and its memory mapped.
     """
     first, later = {}, {name: [] for name in jobs}
     for name, (job, _) in jobs.items():
@@ -204,12 +238,17 @@ def timed(jobs: Jobs, repeats: int) -> dict:
                 job()
                 calls += 1
             later[name].append((time.perf_counter() - start) / calls)
-    return {name: (np.median(times), min(times), max(times), first[name]) for name, times in later.items()}
+    return {
+        name: (np.median(times), min(times), max(times), first[name])
+        for name, times in later.items()
+    }
 
 
 def extended_ends(work: Workload, index: np.ndarray) -> np.ndarray | None:
     """heyoka in long double, whose own error is a thousandth of any double's; None without it."""
-    jobs = peers.heyoka_singles(work.theta1[index], work.theta2[index], work.duration, (1e-18,), np.longdouble)
+    jobs = peers.heyoka_singles(
+        work.theta1[index], work.theta2[index], work.duration, (1e-18,), np.longdouble
+    )
     return next(iter(jobs.values()))() if jobs else None
 
 
@@ -219,14 +258,25 @@ def finest(work: Workload) -> np.ndarray:
     if work.name == SINGLE:
         scheme = dpend.Scheme("rk8-circle", 1e-3)
     else:
-        scheme = dpend.Scheme("rk10-circle-rescaled", 0.13 / float(dpend.normal_modes(dpend.Pendulum())[1].frequency))
+        scheme = dpend.Scheme(
+            "rk10-circle-rescaled", 0.13 / float(dpend.normal_modes(dpend.Pendulum())[1].frequency)
+        )
     job, _ = our_lanes(work, {"finest": scheme})["finest"]
     return job()
 
 
 def peak_memory(workload: str, method: str, quick: bool) -> float:
-    """The peak resident memory [MB] of a process that runs one method on one workload; NaN where it cannot be read."""
-    command = [sys.executable, __file__, "--memory", workload, method, *(["--quick"] if quick else [])]
+    """The peak resident memory [MB] of a process that runs one method on one workload; NaN where it
+    cannot be read.
+    """
+    command = [
+        sys.executable,
+        __file__,
+        "--memory",
+        workload,
+        method,
+        *(["--quick"] if quick else []),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return float(done.stdout.split()[-1])
 
@@ -242,7 +292,9 @@ def tell_memory(workload: str, method: str, quick: bool) -> None:
 
 
 def plain_jax(count: int) -> None:
-    """Prints the rate of jit(vmap) of RK4 over jnp.sin with JAX's defaults: in a process that never imports dpend."""
+    """Prints the rate of jit(vmap) of RK4 over jnp.sin with JAX's defaults: in a process that never
+    imports dpend.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -263,7 +315,9 @@ def plain_jax(count: int) -> None:
         k3 = slope(x + h / 2 * k2)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + slope(x + h * k3))
 
-    lanes = jnp.stack([jnp.linspace(1.0, 2.6, count), jnp.full(count, 1.1), jnp.zeros(count), jnp.zeros(count)], 1)
+    lanes = jnp.stack(
+        [jnp.linspace(1.0, 2.6, count), jnp.full(count, 1.1), jnp.zeros(count), jnp.zeros(count)], 1
+    )
     run = jax.jit(jax.vmap(lambda x: jax.lax.fori_loop(0, 1000, step, x)))
     ends = run(lanes).block_until_ready()
     seconds = []
@@ -285,7 +339,10 @@ def measured(quick: bool) -> list[Row]:
             drawn = np.random.default_rng(0).permutation(lanes)[:RANDOM_LANES]
         exact, fine = extended_ends(work, drawn), finest(work)
         if exact is not None:
-            print(f"  our finest run against long double: {np.abs(fine[:, drawn] - exact).max(axis=0).max():.1e} rad")
+            print(
+                f"  our finest run against long double: "
+                f"{np.abs(fine[:, drawn] - exact).max(axis=0).max():.1e} rad"
+            )
         times = timed(jobs, 1 if quick else 5)
         memory = {}
         for (method, setting), (job, index) in jobs.items():
@@ -301,15 +358,27 @@ def measured(quick: bool) -> list[Row]:
             all_errors = np.abs(ends - fine[:, index]).max(axis=0)
             median, least, most, first = times[method, setting]
             seconds = index.size * work.duration
-            rows.append(Row(
-                work.name, method, setting, index.size, seconds / median, seconds / most, seconds / least,
-                first, memory[method], *np.quantile(errors, [0.5, 0.99, 1.0]),
-                *np.quantile(all_errors, [0.99, 1.0]),
-            ))  # fmt: skip
+            rows.append(
+                Row(
+                    work.name,
+                    method,
+                    setting,
+                    index.size,
+                    seconds / median,
+                    seconds / most,
+                    seconds / least,
+                    first,
+                    memory[method],
+                    *np.quantile(errors, [0.5, 0.99, 1.0]),
+                    *np.quantile(all_errors, [0.99, 1.0]),
+                )
+            )
             row = rows[-1]
             print(
-                f"  {method:26s} {setting:8.1e}  error {row.error_99:8.1e} ({row.error_99_all_lanes:8.1e})  "
-                f"{row.rate:10.4g} s/s  first call {row.first_call_s:6.2f} s  {row.peak_memory_MB:6.0f} MB",
+                f"  {method:26s} {setting:8.1e}  error {row.error_99:8.1e} "
+                f"({row.error_99_all_lanes:8.1e})  "
+                f"{row.rate:10.4g} s/s  first call {row.first_call_s:6.2f} "
+                f"s  {row.peak_memory_MB:6.0f} MB",
                 flush=True,
             )
     environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
@@ -317,18 +386,31 @@ def measured(quick: bool) -> list[Row]:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     like = next(row for row in rows if (row.workload, row.method) == (EASY, "rk4"))
     rate, unknown = float(done.stdout.split()[0]), float("nan")
-    rows.append(Row(
-        EASY, "jit(vmap) of RK4, jnp.sin", 1e-3, 2048, rate, unknown, unknown, unknown, unknown,
-        like.error_median, *(unknown,) * 4,
-    ))  # fmt: skip
+    rows.append(
+        Row(
+            EASY,
+            "jit(vmap) of RK4, jnp.sin",
+            1e-3,
+            2048,
+            rate,
+            unknown,
+            unknown,
+            unknown,
+            unknown,
+            like.error_median,
+            *(unknown,) * 4,
+        )
+    )
     return rows
 
 
-# --- energy over a long time ------------------------------------------------------------------------------------------
+# --- energy over a long time ----------------------------------------------------------------------
 
 
 def energies(quick: bool) -> list[tuple[str, float, float, float]]:
-    """(method, step, time, largest energy error until then): the in-phase orbit of 40 degrees, at about equal cost."""
+    """(method, step, time, largest energy error until then): the in-phase orbit of 40 degrees, at
+    about equal cost.
+    """
     import jax
     import jax.numpy as jnp
 
@@ -356,19 +438,26 @@ def energies(quick: bool) -> list[tuple[str, float, float, float]]:
     return rows
 
 
-# --- the figure -------------------------------------------------------------------------------------------------------
+# --- the figure -----------------------------------------------------------------------------------
 
 # Okabe and Ito's colours; ours are filled and solid, peers open and dashed.
 LOOKS = {
-    "dpend, for a tolerance": ("#D55E00", "o", "-"), "dpend.simulate": ("#D55E00", "o", "-"),
-    "rk4": ("#56B4E9", "s", "-"), "rk4-circle": ("#0072B2", "s", "-"), "rk8": ("#E69F00", "D", "-"),
+    "dpend, for a tolerance": ("#D55E00", "o", "-"),
+    "dpend.simulate": ("#D55E00", "o", "-"),
+    "rk4": ("#56B4E9", "s", "-"),
+    "rk4-circle": ("#0072B2", "s", "-"),
+    "rk8": ("#E69F00", "D", "-"),
     "rk8-circle": ("#CC79A7", "D", "-"),
     "gauss": ("#009E73", "^", "-"),
-    "heyoka, SIMD batch": ("#000000", "o", "--"), "heyoka, adaptive": ("#000000", "o", "--"),
-    "diffrax, vmap of Dopri8": ("#666666", "v", "--"), "diffrax, Dopri8": ("#666666", "v", "--"),
-    "scipy, DOP853": ("#999999", "P", "--"), "numba, RK4": ("#999999", "X", "--"), "C, RK4": ("#444444", "s", "--"),
+    "heyoka, SIMD batch": ("#000000", "o", "--"),
+    "heyoka, adaptive": ("#000000", "o", "--"),
+    "diffrax, vmap of Dopri8": ("#666666", "v", "--"),
+    "diffrax, Dopri8": ("#666666", "v", "--"),
+    "scipy, DOP853": ("#999999", "P", "--"),
+    "numba, RK4": ("#999999", "X", "--"),
+    "C, RK4": ("#444444", "s", "--"),
     "C, RK4 without sines": ("#444444", "d", "--"),
-}  # fmt: skip
+}
 
 
 def draw(rows: list[Row], energy: list[tuple[str, float, float, float]]) -> None:
@@ -381,15 +470,29 @@ def draw(rows: list[Row], energy: list[tuple[str, float, float, float]]) -> None
     for axis, workload in zip(axes.flat, (SINGLE, EASY, HARD), strict=False):
         for method, (colour, marker, line) in LOOKS.items():
             points = sorted(
-                (row.error_99, row.rate) for row in rows if (row.workload, row.method) == (workload, method)
+                (row.error_99, row.rate)
+                for row in rows
+                if (row.workload, row.method) == (workload, method)
             )
             if not points:
                 continue
             face = colour if line == "-" else "white"
             axis.plot(
-                *zip(*points, strict=True), line, color=colour, marker=marker, mfc=face, label=method, lw=1.6, ms=6
+                *zip(*points, strict=True),
+                line,
+                color=colour,
+                marker=marker,
+                mfc=face,
+                label=method,
+                lw=1.6,
+                ms=6,
             )
-        axis.set(xscale="log", yscale="log", title=workload, xlabel="error of the larger angle, 99th percentile (rad)")
+        axis.set(
+            xscale="log",
+            yscale="log",
+            title=workload,
+            xlabel="error of the larger angle, 99th percentile (rad)",
+        )
         axis.set_ylabel("trajectory-seconds per second")
         axis.invert_xaxis()
         axis.grid(alpha=0.3)
@@ -407,23 +510,27 @@ def draw(rows: list[Row], energy: list[tuple[str, float, float, float]]) -> None
             ms=4,
             label=label,
         )
-    axis.set(xscale="log", yscale="log", title="energy: in-phase orbit of 40 deg", xlabel="time (s)")
+    axis.set(
+        xscale="log", yscale="log", title="energy: in-phase orbit of 40 deg", xlabel="time (s)"
+    )
     axis.set_ylabel("largest energy error so far, of the swing's")
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
     figure.savefig(HERE / "figures" / "speed_vs_error.png", dpi=80)
 
 
-# --- the table in README.md -------------------------------------------------------------------------------------------
+# --- the table in README.md -----------------------------------------------------------------------
 
 START, END = "<!-- written by experiments/speed_vs_error.py -->\n", "\n<!-- end -->"
 
 
 def times(rows: list[Row], peer: str, row: Row) -> str:
-    """A rate over a peer's at the same error, the peer's interpolated in logarithms; at errors below all of the
-    peer's, that it is more than over its most exact.
+    """A rate over a peer's at the same error, the peer's interpolated in logarithms; at errors
+    below all of the peer's, that it is more than over its most exact.
     """
-    points = sorted((row.error_99, row.rate) for row in rows if row.method == peer and row.error_99 > 0)
+    points = sorted(
+        (row.error_99, row.rate) for row in rows if row.method == peer and row.error_99 > 0
+    )
     if len(points) < 2 or row.error_99 > 1.1 * points[-1][0]:
         return "-"
     errors, rates = np.log(np.array(points)).T
@@ -438,7 +545,8 @@ def short(value: float) -> str:
 def table(rows: list[Row]) -> str:
     """What README.md shows, from the rows of the CSV file alone."""
     lines = [
-        "| workload | asked | error, 99 % | worst | rate (s/s) | times heyoka | times diffrax | first call |",
+        "| workload | asked | error, 99 % | worst | rate (s/s) | times heyoka | times diffrax | "
+        "first call |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for workload, method, heyoka, diffrax in (
@@ -449,7 +557,11 @@ def table(rows: list[Row]) -> str:
         here = [row for row in rows if row.workload == workload]
         for row in (row for row in here if row.method == method):
             ratios = [times(here, peer, row) for peer in (heyoka, diffrax)]
-            asked = f"{row.setting:g} rad" if "tolerance" in method else f"{method}, {row.setting * 1e3:g} ms"
+            asked = (
+                f"{row.setting:g} rad"
+                if "tolerance" in method
+                else f"{method}, {row.setting * 1e3:g} ms"
+            )
             rate = f"{float(f'{row.rate:.3g}'):,.0f}".replace(",", " ")
             cells = [
                 workload,
@@ -464,13 +576,19 @@ def table(rows: list[Row]) -> str:
     easy = {(row.method, row.setting): row.rate for row in rows if row.workload == EASY}
     ours, sines = easy["rk4-circle", 1e-3], easy["rk4", 1e-3]
     others = {
-        "an AVX-512 kernel in C of the same arithmetic": ours / easy.get(("C, RK4 without sines", 1e-3), np.nan),
+        "an AVX-512 kernel in C of the same arithmetic": ours
+        / easy.get(("C, RK4 without sines", 1e-3), np.nan),
         "one with sines": ours / easy.get(("C, RK4", 1e-3), np.nan),
         "numba": ours / easy.get(("numba, RK4", 1e-3), np.nan),
         "`jit(vmap)` over `jnp.sin`": ours / easy.get(("jit(vmap) of RK4, jnp.sin", 1e-3), np.nan),
     }
-    ratios = ", ".join(f"{short(value)} times {name}" for name, value in others.items() if np.isfinite(value))
-    text = f"At order 4 and 1 ms on the easy lanes `rk4-circle` takes {ours / 1e3:.0f} million steps a second: {ratios}"
+    ratios = ", ".join(
+        f"{short(value)} times {name}" for name, value in others.items() if np.isfinite(value)
+    )
+    text = (
+        f"At order 4 and 1 ms on the easy lanes `rk4-circle` takes {ours / 1e3:.0f} million "
+        f"steps a second: {ratios}"
+    )
     c_with = sines / easy.get(("C, RK4", 1e-3), np.nan)
     text += (
         f"; `rk4` {sines / 1e3:.0f} million, {short(c_with)} times the kernel with sines."
@@ -482,7 +600,10 @@ def table(rows: list[Row]) -> str:
 
 def read_rows() -> list[Row]:
     with (HERE / "speed_vs_error.csv").open(newline="") as file:
-        return [Row(*(kind.type(row[kind.name]) for kind in fields(Row))) for row in csv.DictReader(file)]
+        return [
+            Row(*(kind.type(row[kind.name]) for kind in fields(Row)))
+            for row in csv.DictReader(file)
+        ]
 
 
 def write_table() -> None:
@@ -491,7 +612,9 @@ def write_table() -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--memory", nargs=2, metavar=("WORKLOAD", "METHOD"))
@@ -512,12 +635,17 @@ def main() -> None:
             out.writeheader()
             for row in rows:
                 out.writerow(
-                    {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in asdict(row).items()}
+                    {
+                        key: f"{value:.6g}" if isinstance(value, float) else value
+                        for key, value in asdict(row).items()
+                    }
                 )
         with (HERE / "energy_error.csv").open("w", newline="") as file:
             out_energy = csv.writer(file, lineterminator="\n")
             out_energy.writerow(["method", "step_s", "time_s", "largest_energy_error_of_the_swing"])
-            out_energy.writerows((name, step, f"{at:.6g}", f"{error:.3g}") for name, step, at, error in energy)
+            out_energy.writerows(
+                (name, step, f"{at:.6g}", f"{error:.3g}") for name, step, at, error in energy
+            )
         draw(rows, energy)
     write_table()
 

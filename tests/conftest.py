@@ -1,4 +1,6 @@
-"""A strict climate: float64, warnings are errors (pyproject.toml), strict promotion, and shapes checked at run time."""
+"""A strict climate: float64, warnings are errors (pyproject.toml), strict promotion, and shapes
+checked at run time.
+"""
 
 import os
 

@@ -5,8 +5,8 @@ import jax
 import dpend
 from dpend.orbits.stability import transition
 
-# The paper's pendulum released at 40 deg: theta2 [deg] and period of every return within 1 s, as scanned elsewhere on
-# 40 000 values of theta2; two of them are the second return of another.
+# The paper's pendulum released at 40 deg: theta2 [deg] and period of every return within 1 s, as
+# scanned elsewhere on 40 000 values of theta2; two of them are the second return of another.
 FORTY = [
     (-157.229758666, 0.789605931),
     (-157.229758666, 1.579211862),
@@ -24,4 +24,6 @@ FORTY = [
 @jax.jit
 def monodromy(orbit, part, steps=1600):
     """The derivative of the flow over `part` of the period, in one piece of so many steps."""
-    return transition(orbit.pendulum, orbit.state, part * orbit.period / steps, steps, dpend.Scheme("rk8", 1.0))[1]
+    return transition(
+        orbit.pendulum, orbit.state, part * orbit.period / steps, steps, dpend.Scheme("rk8", 1.0)
+    )[1]

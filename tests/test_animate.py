@@ -14,12 +14,16 @@ from dpend import animate, cli
 @pytest.fixture(scope="module")
 def pair():
     pendulum = dpend.Pendulum()
-    return pendulum, animate.motions_for(pendulum, [dpend.released(2.0, 1.0), dpend.released(2.9, -2.0)], 0.4)
+    return pendulum, animate.motions_for(
+        pendulum, [dpend.released(2.0, 1.0), dpend.released(2.9, -2.0)], 0.4
+    )
 
 
 def test_a_film_lasts_as_long_as_the_motion(pair, tmp_path):
     told = []
-    count = animate.film(*pair, tmp_path / "f.gif", progress=lambda done, total: told.append((done, total)))
+    count = animate.film(
+        *pair, tmp_path / "f.gif", progress=lambda done, total: told.append((done, total))
+    )
     with Image.open(tmp_path / "f.gif") as film:
         assert film.n_frames == count == 11  # both ends shown
         assert film.info["duration"] * (count - 1) == 400
@@ -37,7 +41,8 @@ def test_a_frame_shows_both_bobs_where_they_are(pair):
         where = dpend.positions(pendulum, end)
         reach = 1.1 * 0.4
         column, row = (
-            int(480 * (0.5 + sign * float(x[-1]) / (2 * reach))) for x, sign in ((where.x2, 1), (where.y2, -1))
+            int(480 * (0.5 + sign * float(x[-1]) / (2 * reach)))
+            for x, sign in ((where.x2, 1), (where.y2, -1))
         )
         expected = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
         assert np.abs(last[row, column].astype(int) - expected).max() < 12
@@ -50,7 +55,9 @@ def test_a_strobe_darkens_towards_the_end(pair, tmp_path):
         picture = np.asarray(file.convert("L"))
 
     def darkness(index):
-        state = dpend.State(*(leaf[index] for leaf in (motions[0].state.theta1, motions[0].state.theta2)), 0.0, 0.0)
+        state = dpend.State(
+            *(leaf[index] for leaf in (motions[0].state.theta1, motions[0].state.theta2)), 0.0, 0.0
+        )
         where = dpend.positions(pendulum, state)
         column = int(picture.shape[1] * (0.5 + float(where.x2) / 0.88))
         row = int(picture.shape[0] * (0.5 - float(where.y2) / 0.88))
@@ -90,14 +97,21 @@ def test_an_interrupted_film_leaves_the_old_one(pair, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ("--theta1 1 --theta1 2 --theta2 1 --duration 1 --out f.gif", "must be given equally often, got 2 and 1"),
+        ("--theta1 1 --theta1 2 --theta2 1 --duration 1 --out f.gif", "must be given equally "
+                                                                      "often, got 2 and 1"),
         ("--theta1 1 --theta2 1 --duration 1 --out f.avi", "out must end in .gif or .mp4 or .png"),
-        ("--theta1 1 --theta2 1 --duration 1e9 --out f.gif", "duration must give at most 10000 frames"),
-        ("--theta1 1 --theta2 1 --duration 0 --out f.gif", "duration must be a finite positive number"),
-        ("--theta1 1 --theta2 1 --duration 1 --speed 0 --out f.gif", "speed must be a finite positive number"),
-        ("--theta1 1 --theta2 1 --duration 1 --speed 1e12 --out f.gif", "speed must show the motion of 1 s"),
-        ("--theta1 1 --theta2 1 --duration 1e300 --speed 1e-300 --out f.gif", "must give at most 10000 frames"),
-        ("--theta1 1 --theta2 1 --duration 1 --g 1e30 --out f.gif", "duration must take at most 1e+07 steps"),
+        ("--theta1 1 --theta2 1 --duration 1e9 --out f.gif", "duration must give at most 10000 "
+                                                             "frames"),
+        ("--theta1 1 --theta2 1 --duration 0 --out f.gif", "duration must be a finite positive "
+                                                           "number"),
+        ("--theta1 1 --theta2 1 --duration 1 --speed 0 --out f.gif", "speed must be a finite "
+                                                                     "positive number"),
+        ("--theta1 1 --theta2 1 --duration 1 --speed 1e12 --out f.gif", "speed must show the "
+                                                                        "motion of 1 s"),
+        ("--theta1 1 --theta2 1 --duration 1e300 --speed 1e-300 --out f.gif", "must give at most "
+                                                                              "10000 frames"),
+        ("--theta1 1 --theta2 1 --duration 1 --g 1e30 --out f.gif", "duration must take at most "
+                                                                    "1e+07 steps"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line(capsys, monkeypatch, tmp_path, arguments, line):

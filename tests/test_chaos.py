@@ -1,4 +1,6 @@
-"""Exponents that are known, laws that all spectra keep, and tangents that leave the motion alone."""
+"""Exponents that are known, laws that all spectra keep, and tangents that leave the motion
+alone.
+"""
 
 import math
 
@@ -18,15 +20,21 @@ def test_an_equilibrium_has_its_linear_exponent(unit):
     """At the upright state the flow is linear: the largest exponent of the two pairs."""
     largest = float(np.max(np.real(equilibria(unit).exponents[3])))
     # The state itself stays for some 20/s before rounding lets it fall.
-    found = chaos.lyapunov(unit, dpend.released(math.pi, math.pi), Scheme("rk8", 1e-2), duration=12.0)
-    again = chaos.lyapunov(unit, dpend.released(math.pi, math.pi), Scheme("rk8", 1e-2), duration=8.0)
+    found = chaos.lyapunov(
+        unit, dpend.released(math.pi, math.pi), Scheme("rk8", 1e-2), duration=12.0
+    )
+    again = chaos.lyapunov(
+        unit, dpend.released(math.pi, math.pi), Scheme("rk8", 1e-2), duration=8.0
+    )
     assert abs((12 * found["lyapunov"] - 8 * again["lyapunov"]) / 4 - largest) < 1e-4
 
 
 def test_small_swings_are_a_linear_system(unit):
     """No growth beyond a constant: the exponent falls like 1/T, below 2 ln(T)/T."""
     for amplitude in (1e-6, 0.3):
-        found = chaos.lyapunov(unit, dpend.released(amplitude, 0.4 * amplitude), FAST, duration=500.0)
+        found = chaos.lyapunov(
+            unit, dpend.released(amplitude, 0.4 * amplitude), FAST, duration=500.0
+        )
         assert abs(found["lyapunov"]) < 2 * math.log(500) / 500
 
 
@@ -54,13 +62,24 @@ def test_megno_tells_order_from_chaos(unit):
     assert abs(regular - 2) < 0.2
     chaotic = dpend.released(2.9, 2.8)
     found = chaos.maximal_lyapunov(unit, chaotic, FAST, duration=1000.0)
-    assert abs(chaos.megno(unit, chaotic, FAST, duration=1000.0)["megno"] / (500 * found["exponent"]) - 1) < 0.2
+    assert (
+        abs(
+            chaos.megno(unit, chaotic, FAST, duration=1000.0)["megno"] / (500 * found["exponent"])
+            - 1
+        )
+        < 0.2
+    )
     longer = chaos.maximal_lyapunov(unit, chaotic, FAST, duration=1000.0, windows=40)
-    # Other windows cut other steps, and what is chaotic is then another motion: two independent estimates.
-    assert abs(longer["exponent"] - found["exponent"]) < 2 * (found["uncertainty"] + longer["uncertainty"])
+    # Other windows cut other steps, and what is chaotic is then another motion: two independent
+    # estimates.
+    assert abs(longer["exponent"] - found["exponent"]) < 2 * (
+        found["uncertainty"] + longer["uncertainty"]
+    )
 
 
-@pytest.mark.parametrize("name", ["rk4", pytest.param("rk4-circle", marks=pytest.mark.slow), "rk8-circle-rescaled"])
+@pytest.mark.parametrize(
+    "name", ["rk4", pytest.param("rk4-circle", marks=pytest.mark.slow), "rk8-circle-rescaled"]
+)
 def test_tangents_leave_the_motion_alone_and_are_derivatives(paper, name):
     scheme, start = Scheme(name, 1e-3), dpend.released(2.5, -1.0)
 
@@ -82,7 +101,9 @@ def test_tangents_leave_the_motion_alone_and_are_derivatives(paper, name):
 
 
 def test_flip_times(paper):
-    """Against the crossing of theta2 = pi found by hand on diffrax's solution; none below the saddle."""
+    """Against the crossing of theta2 = pi found by hand on diffrax's solution; none below the
+    saddle.
+    """
     found = chaos.flip(paper, dpend.released(2.0, 2.6), Scheme("rk8", 2e-3), duration=2.0)
     motion = dpend.reference(paper, dpend.released(2.0, 2.6), [float(found["flip_time"])])
     angle = motion.state.theta1[-1] if found["bob"] == 1 else motion.state.theta2[-1]
@@ -97,7 +118,13 @@ def test_flip_times(paper):
 def test_drift_is_that_of_the_saved_motion(paper):
     start, scheme = dpend.released(2.5, -1.0), Scheme("rk4", 1e-2)
     motion = dpend.simulate(paper, start, 2.0, step=1e-2, method="rk4", error=False)
-    assert abs(chaos.drift(paper, start, scheme, duration=2.0)["energy_drift"] / motion.energy_drift - 1) < 1e-6
+    assert (
+        abs(
+            chaos.drift(paper, start, scheme, duration=2.0)["energy_drift"] / motion.energy_drift
+            - 1
+        )
+        < 1e-6
+    )
 
 
 def test_windows_are_checked(paper):

@@ -42,13 +42,20 @@ def test_both_partners_of_forty_degrees(capsys):
     assert abs(outer["theta2_deg"] + 51.139513966294) < 1e-9
     assert [inner["branch"], outer["branch"]] == ["in-phase", "anti-phase"]
     assert inner.keys() >= set(
-        "theta1_deg theta2_deg period_s energy_J residual iterations status symmetry kappa stability dual turns"
+        "theta1_deg theta2_deg period_s energy_J residual iterations status symmetry kappa "
+        "stability dual turns"
         " error_estimate".split()
     )
     assert inner["error_estimate"].keys() == {"theta2_deg", "period_s"}
-    assert (inner["status"], inner["symmetry"], inner["stability"]) == ("converged", "centred", "elliptic")
+    assert (inner["status"], inner["symmetry"], inner["stability"]) == (
+        "converged",
+        "centred",
+        "elliptic",
+    )
     # H of the release itself.
-    expected = -0.2 * 9.8 * 0.2 * np.cos(np.radians(40)) - 0.1 * 9.8 * 0.2 * np.cos(np.radians(49.066544773743))
+    expected = -0.2 * 9.8 * 0.2 * np.cos(np.radians(40)) - 0.1 * 9.8 * 0.2 * np.cos(
+        np.radians(49.066544773743)
+    )
     assert abs(inner["energy_J"] - expected) < 1e-12
 
 
@@ -83,10 +90,19 @@ def test_a_design(capsys):
         (("--period", 1), "branch must be given with period and kappa"),
         (("--branch", "x", "--period", 1), "branch must be one of in-phase, anti-phase, got 'x'"),
         (("--branch", "in-phase", "--period", -1), "period must be a finite positive number"),
-        (("--branch", "in-phase", "--kappa", "0", "--free", "l1,x"), "free must name one or more of"),
-        (("--branch", "in-phase", "--kappa", 0, "--period", 1, "--free", "g"), "free must name as many parameters"),
+        (
+            ("--branch", "in-phase", "--kappa", "0", "--free", "l1,x"),
+            "free must name one or more of",
+        ),
+        (
+            ("--branch", "in-phase", "--kappa", 0, "--period", 1, "--free", "g"),
+            "free must name as many parameters",
+        ),
         (("--ratio", 2, "--bounds", "l1=1"), "bounds must be NAME=A:B, got 'l1=1'"),
-        (("--ratio", 2, "--bounds", "l1=.1:.3", "--bounds", "l1=.1:.4"), "bounds must be given once a name"),
+        (
+            ("--ratio", 2, "--bounds", "l1=.1:.3", "--bounds", "l1=.1:.4"),
+            "bounds must be given once a name",
+        ),
         (("--ratio", 2, "--bounds", "l1=.3:.4"), "bounds of l1 must be two numbers with the start"),
     ],
 )
@@ -129,16 +145,31 @@ def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
         (("theta2", "10"), "theta2 must be a range A:B in degrees"),
         (("duration", "-1"), "duration must be a finite positive number"),
         (("figure", "here.pdf"), "figure must end in .png"),
-        (("figure", "/proc/m.png"), "figure must be a file in a directory that can be written to, got /proc/m.png"),
-        (("out", "/proc/m.zarr"), "out must be a new name in a directory that can be written to, got /proc/m.zarr"),
-        (("out", "/no/such/place/m.zarr"), "out must be a new name in a directory that can be written to"),
-        (("out", f"{'m' * 300}.zarr"), "out must be a new name in a directory that can be written to"),
+        (
+            ("figure", "/proc/m.png"),
+            "figure must be a file in a directory that can be written to, got /proc/m.png",
+        ),
+        (
+            ("out", "/proc/m.zarr"),
+            "out must be a new name in a directory that can be written to, got /proc/m.zarr",
+        ),
+        (
+            ("out", "/no/such/place/m.zarr"),
+            "out must be a new name in a directory that can be written to",
+        ),
+        (
+            ("out", f"{'m' * 300}.zarr"),
+            "out must be a new name in a directory that can be written to",
+        ),
         (("out", "."), "out must be a Zarr store of a sweep or a new name, got .:"),
         (("method", "rk4"), "step must be given with method"),
         (("error", "all"), "error must be None or"),
         (("duration", "1e6"), "duration and step must leave at most 1e+06 steps to one motion"),
         (("l1", "1e-300"), "duration and step must leave at most 1e+06 steps to one motion"),
-        (("most-steps", "1e3"), "duration and step must leave at most 0.001 steps to one motion and 1e+03 to all"),
+        (
+            ("most-steps", "1e3"),
+            "duration and step must leave at most 0.001 steps to one motion and 1e+03 to all",
+        ),
     ],
 )
 def test_bad_maps_are_refused_in_one_line(capsys, tmp_path, change, text):
@@ -156,7 +187,9 @@ def test_a_damaged_map_is_mended_and_a_long_one_told(capsys, tmp_path, monkeypat
     command = ("map", "flip", "--size", "8", "--duration", "1", "--out", tmp_path / "m.zarr")
     status, _, err = run(capsys, *command)
     assert (status, err.count("\n")) == (0, 1)
-    assert err.startswith("dpend: about 1.5e+03 time steps, which may take 1 minutes, for 32 cells; ")
+    assert err.startswith(
+        "dpend: about 1.5e+03 time steps, which may take 1 minutes, for 32 cells; "
+    )
     chunk = tmp_path / "m.zarr" / "flip_time" / "c" / "0" / "0"
     right = chunk.read_bytes()
     chunk.write_bytes(right[:-1])
@@ -164,13 +197,16 @@ def test_a_damaged_map_is_mended_and_a_long_one_told(capsys, tmp_path, monkeypat
     status, _, err = run(capsys, *command)
     assert (status, chunk.read_bytes()) == (0, right)
     assert err == (
-        f"dpend: store {tmp_path / 'm.zarr'} is damaged: flip_time/c/0/0 has other bytes than were written; "
+        f"dpend: store {tmp_path / 'm.zarr'} is damaged: flip_time/c/0/0 has other bytes than were "
+        f"written; "
         "what is damaged is made again, 1 of 4 tiles\n"
     )
 
 
 def test_map_names_are_checked(capsys, tmp_path):
-    status, _, err = run(capsys, "map", "entropy", "--size", 4, "--duration", 1, "--out", tmp_path / "m.zarr")
+    status, _, err = run(
+        capsys, "map", "entropy", "--size", 4, "--duration", 1, "--out", tmp_path / "m.zarr"
+    )
     assert status == 2
     assert "map must be one of lyapunov, megno, flip, drift, got 'entropy'" in err
 
@@ -195,7 +231,9 @@ def test_what_did_not_converge_says_why(capsys):
     status, orbit = run_json(capsys, "orbit", "--theta1", 181, "--branch", "in-phase")
     assert (status, orbit["status"]) == (1, "no_such_orbit")
     assert "largest" in orbit["message"]
-    status, motion = run_json(capsys, "simulate", "--theta1", 170, "--theta2", 180, "--duration", 20, "--step", 0.002)
+    status, motion = run_json(
+        capsys, "simulate", "--theta1", 170, "--theta2", 180, "--duration", 20, "--step", 0.002
+    )
     assert (status, motion["status"], motion["tolerance"]) == (1, "beyond_horizon", None)
     assert f"{motion['error_estimate']:.1e} rad, is above 0.1 rad" in motion["message"]
 
@@ -207,9 +245,22 @@ def test_nan_and_infinity_are_null(capsys):
 
 def test_simulate(capsys, paper):
     status, motion = run_json(
-        capsys, "simulate", "--theta1", 40, "--theta2", 49.1, "--duration", 3, "--method", "rk4", "--step", 0.001
+        capsys,
+        "simulate",
+        "--theta1",
+        40,
+        "--theta2",
+        49.1,
+        "--duration",
+        3,
+        "--method",
+        "rk4",
+        "--step",
+        0.001,
     )
-    end = dpend.flow(paper, dpend.released(np.radians(40), np.radians(49.1)), 3.0, dpend.Scheme("rk4", 1e-3))
+    end = dpend.flow(
+        paper, dpend.released(np.radians(40), np.radians(49.1)), 3.0, dpend.Scheme("rk4", 1e-3)
+    )
     assert status == 0
     assert motion["steps"] == 3000
     assert abs(motion["final"]["theta1_deg"] - np.degrees(end.theta1)) < 1e-9
@@ -221,7 +272,19 @@ def test_simulate(capsys, paper):
 def test_files_hold_the_motion(capsys, tmp_path):
     import xarray
 
-    common = ("simulate", "--theta1", 40, "--theta2", 10, "--p1", 0.01, "--duration", 1, "--step", 0.01)
+    common = (
+        "simulate",
+        "--theta1",
+        40,
+        "--theta2",
+        10,
+        "--p1",
+        0.01,
+        "--duration",
+        1,
+        "--step",
+        0.01,
+    )
     for name in ("motion.csv", "motion.nc"):
         assert run(capsys, *common, "--out", tmp_path / name)[0] == 0
     table = np.genfromtxt(tmp_path / "motion.csv", delimiter=",", names=True)
@@ -242,7 +305,19 @@ def test_a_failed_write_leaves_the_old_file(capsys, tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr(report, "_write_csv", fails)
-    arguments = ("simulate", "--theta1", 40, "--theta2", 10, "--duration", 1, "--step", 0.01, "--out", target)
+    arguments = (
+        "simulate",
+        "--theta1",
+        40,
+        "--theta2",
+        10,
+        "--duration",
+        1,
+        "--step",
+        0.01,
+        "--out",
+        target,
+    )
     status, _, err = run(capsys, *arguments)
     assert (status, err) == (2, "dpend: disk full\n")
     assert [path.name for path in tmp_path.iterdir()] == ["motion.csv"]
@@ -254,7 +329,8 @@ MAP = ("map", "flip", "--size", "4", "--duration", "0.5")
 
 
 @pytest.mark.parametrize(
-    ("command", "option", "name"), [(ANIMATE, "out", "old.gif"), (MAP, "out", "old.zarr"), (MAP, "figure", "old.png")]
+    ("command", "option", "name"),
+    [(ANIMATE, "out", "old.gif"), (MAP, "out", "old.zarr"), (MAP, "figure", "old.png")],
 )
 def test_where_nothing_can_be_written_the_old_file_stays(capsys, tmp_path, command, option, name):
     place = tmp_path / "locked"
@@ -293,12 +369,28 @@ SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
         (("orbit", "--theta1", "40", "--l2", "-0.2"), "l2 .*positive .* -0.2"),
         (("orbit", "--theta1", "40", "--g", "0"), "g must be positive for an orbit, got 0"),
         (("orbit", "--theta1", "40", "--g", "-9.8"), "g must be positive for an orbit, got -9.8"),
-        (("orbit", "--theta1", "180", "--branch", "in-phase"), "theta1 .*multiple of 180 degrees .* got 180"),
+        (
+            ("orbit", "--theta1", "180", "--branch", "in-phase"),
+            "theta1 .*multiple of 180 degrees .* got 180",
+        ),
         (("orbit", "--theta1", "0"), "theta1 .*multiple of 180"),
         (("orbit", "--theta1", "180", "--theta2", "0", "--period", "1"), "equilibrium"),
-        (("orbit", "--theta1", "40", "--branch", "sideways"), "branch .*in-phase, anti-phase.* 'sideways'"),
         (
-            ("orbit", "--theta1", "40", "--branch", "in-phase", "--theta2", "49", "--period", "1.2"),
+            ("orbit", "--theta1", "40", "--branch", "sideways"),
+            "branch .*in-phase, anti-phase.* 'sideways'",
+        ),
+        (
+            (
+                "orbit",
+                "--theta1",
+                "40",
+                "--branch",
+                "in-phase",
+                "--theta2",
+                "49",
+                "--period",
+                "1.2",
+            ),
             "branch and guess exclude",
         ),
         (("orbit", "--theta1", "40", "--theta2", "49"), "period must be given with theta2"),
@@ -323,13 +415,22 @@ SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
         ((*SIMULATE, "--p1", "nan"), "p1 .*finite"),
         ((*SIMULATE, "--out", "motion.xls"), "out must end in .csv or .nc"),
         ((*SIMULATE, "--out", "/no/such/place/motion.csv"), "out must be a file in a directory"),
-        ((*ANIMATE, "--theta1", "nan", "--theta2", "1", "--out", "f.gif"), "theta1 .*finite number .* nan"),
+        (
+            (*ANIMATE, "--theta1", "nan", "--theta2", "1", "--out", "f.gif"),
+            "theta1 .*finite number .* nan",
+        ),
         ((*ANIMATE, "--m1", "0", "--out", "f.gif"), "m1 .*positive .* 0"),
         ((*ANIMATE, "--l2", "-0.2", "--out", "f.gif"), "l2 .*positive .* -0.2"),
         ((*ANIMATE, "--speed", "fast", "--out", "f.gif"), "--speed.*fast"),
-        ((*ANIMATE, "--out", "/proc/z.gif"), "out must be a file in a directory .* got /proc/z.gif .*another place"),
+        (
+            (*ANIMATE, "--out", "/proc/z.gif"),
+            "out must be a file in a directory .* got /proc/z.gif .*another place",
+        ),
         ((*ANIMATE, "--out", f"{'z' * 300}.gif"), "out must be a file in a directory .* got zzz"),
-        ((*ANIMATE, "--out", "."), "out must end in .gif or .mp4 or .png, got .: give another name"),
+        (
+            (*ANIMATE, "--out", "."),
+            "out must end in .gif or .mp4 or .png, got .: give another name",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_status_two(capsys, arguments, words):
@@ -346,12 +447,22 @@ def test_bad_input_is_one_line_and_status_two(capsys, arguments, words):
 def test_the_program_itself(tmp_path):
     """A process of its own: entry point, cache directory, and the compile options switched off."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "DPEND_PLAIN_JAX": "1"}
-    command = [Path(sys.executable).parent / "dpend", "orbit", "--theta1", "40", "--branch", "in-phase", "--json"]
+    command = [
+        Path(sys.executable).parent / "dpend",
+        "orbit",
+        "--theta1",
+        "40",
+        "--branch",
+        "in-phase",
+        "--json",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert (done.returncode, done.stderr) == (0, "")
     assert abs(json.loads(done.stdout)["theta2_deg"] - 49.066544773743) < 1e-9
     assert list((tmp_path / "dpend").iterdir())
-    refused = subprocess.run([*command[:2], "--theta1", "nan"], capture_output=True, text=True, env=environment)
+    refused = subprocess.run(
+        [*command[:2], "--theta1", "nan"], capture_output=True, text=True, env=environment
+    )
     assert refused.returncode == 2
     assert refused.stderr.startswith("dpend: theta1 must be a finite number")
     assert refused.stderr.count("\n") == 1
@@ -360,8 +471,14 @@ def test_the_program_itself(tmp_path):
 @pytest.mark.slow
 def test_a_family_as_json_and_csv(capsys, tmp_path):
     status, found = run_json(capsys, "family", "--branch", "anti-phase")
-    assert (status, found["status"], found["ends"]) == (0, "converged", ["normal mode", "homoclinic"])
-    assert found["points"][0].keys() >= set("theta1_deg theta2_deg period_s energy_J kappa symmetry".split())
+    assert (status, found["status"], found["ends"]) == (
+        0,
+        "converged",
+        ["normal mode", "homoclinic"],
+    )
+    assert found["points"][0].keys() >= set(
+        "theta1_deg theta2_deg period_s energy_J kappa symmetry".split()
+    )
     assert {point["symmetry"] for point in found["points"]} == {"centred"}
     lost = found["bifurcations"][-1]
     assert lost["kind"] == "stability_lost"
@@ -373,7 +490,9 @@ def test_a_family_as_json_and_csv(capsys, tmp_path):
     assert (status, err) == (0, "")
     assert "stability_lost" in text
     table = np.genfromtxt(out, delimiter=",", names=True, usecols=range(9))
-    np.testing.assert_allclose(table["theta2_deg"], [point["theta2_deg"] for point in found["points"]], rtol=1e-15)
+    np.testing.assert_allclose(
+        table["theta2_deg"], [point["theta2_deg"] for point in found["points"]], rtol=1e-15
+    )
     run(capsys, "family", "--branch", "anti-phase", "--out", tmp_path / "f.json")
     assert json.loads((tmp_path / "f.json").read_text()) == found
     for bad in (
@@ -389,10 +508,15 @@ def test_the_atlas_of_an_angle(capsys, tmp_path):
     status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
     assert status == 0
     periods = [orbit["period_s"] for orbit in found["orbits"]]
-    np.testing.assert_allclose(periods, [0.754418866, 0.789605931, 1.174420237, 1.212756333, 1.283263044], atol=1e-9)
+    np.testing.assert_allclose(
+        periods, [0.754418866, 0.789605931, 1.174420237, 1.212756333, 1.283263044], atol=1e-9
+    )
     keys = set("theta1_deg theta2_deg period_s energy_J kappa symmetry dual residual".split())
     assert keys <= found["orbits"][0].keys()
-    assert set("theta2_points time_points refinements suspicious_cells".split()) <= found["coverage"].keys()
+    assert (
+        set("theta2_points time_points refinements suspicious_cells".split())
+        <= found["coverage"].keys()
+    )
     out = tmp_path / "forty.csv"
     status, text, err = run(capsys, "atlas", "--theta1", 40, "--max-period", 1.3, "--out", out)
     assert (status, err) == (0, "")
@@ -425,7 +549,9 @@ def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_the_atlas_of_the_square(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "_BETWEEN_LINES", float("inf"))  # a slow machine would tell how far it is
+    monkeypatch.setattr(
+        cli, "_BETWEEN_LINES", float("inf")
+    )  # a slow machine would tell how far it is
     store = tmp_path / "s.json"
     status, found = run_json(capsys, "atlas", "--max-period", 1.0, "--store", store)
     assert (status, [one["family"] for one in found["families"]]) == (0, ["C1", "C2", "C3"])
@@ -434,13 +560,16 @@ def test_the_atlas_of_the_square(capsys, tmp_path, monkeypatch):
     assert "3 families" in text
 
 
-# A command, words that make it whole, and its options; every command has those of the pendulum, too.
+# A command, words that make it whole, and its options; every command has those of the pendulum,
+# too.
 FUZZED = {
-    "orbit": (("--theta1", "40", "--branch", "in-phase"), "theta1 theta2 period branch symmetry ratio crossing"),
+    "orbit": (("--theta1", "40", "--branch", "in-phase"), "theta1 theta2 period branch symmetry "
+                                                          "ratio crossing"),
     "family": (("--branch", "in-phase"), "branch out"),
     "atlas": (("--theta1", "40", "--max-period", "1"), "theta1 max-period out store"),
     "design": (
-        ("--theta1", "60", "--branch", "in-phase", "--period", "1"), "theta1 branch period kappa ratio free bounds"
+        ("--theta1", "60", "--branch", "in-phase", "--period", "1"), "theta1 branch period kappa "
+                                                                     "ratio free bounds"
     ),
     "simulate": (SIMULATE[1:], "theta1 theta2 duration p1 p2 method step tolerance most-steps out"),
     "map": (
@@ -452,18 +581,39 @@ FUZZED = {
 }  # fmt: skip
 HOSTILE = ("", "nan", "1e999", "1_000", "٤٠", "abc", "9" * 5000)
 MORE_HOSTILE = (
-    "-inf", "0x10", "1e", "=3", "-", " ", "1,5", "40 50", "\x1b[31m", "é" * 200, "None", "[]", "1:2:3", ",",
+    "-inf",
+    "0x10",
+    "1e",
+    "=3",
+    "-",
+    " ",
+    "1,5",
+    "40 50",
+    "\x1b[31m",
+    "é" * 200,
+    "None",
+    "[]",
+    "1:2:3",
+    ",",
     "no/such/place",
-)  # fmt: skip
+)
 
 
-@pytest.mark.parametrize("values", [HOSTILE, pytest.param(MORE_HOSTILE, marks=pytest.mark.slow)], ids=["some", "more"])
+@pytest.mark.parametrize(
+    "values", [HOSTILE, pytest.param(MORE_HOSTILE, marks=pytest.mark.slow)], ids=["some", "more"]
+)
 @pytest.mark.parametrize("command", FUZZED)
-def test_what_no_option_can_mean_is_refused_by_its_name(capsys, monkeypatch, tmp_path, command, values):
+def test_what_no_option_can_mean_is_refused_by_its_name(
+    capsys, monkeypatch, tmp_path, command, values
+):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "app", get_command(cli.app))  # made once, not for each of two thousand calls
+    monkeypatch.setattr(
+        cli, "app", get_command(cli.app)
+    )  # made once, not for each of two thousand calls
     data = tmp_path / "data.csv"
-    data.write_text("time_s,theta1_deg,theta2_deg\n" + "\n".join(f"0.{i:02d},{i},{i}" for i in range(20)))
+    data.write_text(
+        "time_s,theta1_deg,theta2_deg\n" + "\n".join(f"0.{i:02d},{i},{i}" for i in range(20))
+    )
     words, names = FUZZED[command]
     wrong = []
     for name in [*names.split(), "l1", "l2", "m1", "m2", "g"]:
@@ -471,7 +621,11 @@ def test_what_no_option_can_mean_is_refused_by_its_name(capsys, monkeypatch, tmp
             others = [word for pair in _pairs(words, name) for word in pair]
             status, out, err = run(capsys, command, *others, f"--{name}", value)
             named = name in err.replace("_", "-")
-            told = value[:20].split(",")[0].strip() in err or repr(value)[1:20] in err or "got inf" in err
+            told = (
+                value[:20].split(",")[0].strip() in err
+                or repr(value)[1:20] in err
+                or "got inf" in err
+            )
             if (status, out, err.count("\n"), named, told) != (2, "", 1, True, True):
                 wrong.append((name, value[:30], status, out[:100], err[:200]))
     assert wrong == []
@@ -482,7 +636,11 @@ def _pairs(words, name):
     """The options among `words`, and what stands before them, without those called `name`."""
     first = next((i for i, word in enumerate(words) if word.startswith("--")), len(words))
     yield words[:first]
-    yield from (pair for pair in zip(words[first::2], words[first + 1 :: 2], strict=True) if pair[0] != f"--{name}")
+    yield from (
+        pair
+        for pair in zip(words[first::2], words[first + 1 :: 2], strict=True)
+        if pair[0] != f"--{name}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -491,24 +649,39 @@ def _pairs(words, name):
         ("orbit --theta1 40 --theta1 50", "--theta1 must be given once at most, got it 2 times"),
         ("orbit --theta1 40 --json --json", "--json must be given once at most, got it 2 times"),
         ("orbit --theta1 40 --crossing 2", "crossing must go with branch, got 2 alone"),
-        ("orbit --theta1 40 --branch in-phase --crossing 0", "crossing must be an integer of at least 1"),
-        ("orbit --theta1 40 --branch in-phase --crossing 9223372036854775808", "--crossing.* is beyond 92233720368547"),
-        ("orbit --theta1 40 --branch in-phase --crossing 1.0", "--crossing.*'1.0' is not an integer"),
+        ("orbit --theta1 40 --branch in-phase --crossing 0", "crossing must be an integer of at "
+                                                             "least 1"),
+        ("orbit --theta1 40 --branch in-phase --crossing 9223372036854775808", "--crossing.* is "
+                                                                               "beyond "
+                                                                               "92233720368547"),
+        ("orbit --theta1 40 --branch in-phase --crossing 1.0", "--crossing.*'1.0' is not an "
+                                                               "integer"),
         ("orbit --theta1 40 --symmetry brake", "symmetry goes with guess"),
-        ("design --theta1 60 --branch in-phase --ratio 2", "branch must go with period or kappa, got 'in-phase'"),
-        ("design --theta1 60 --ratio 2 --free l1,,l2", "free must be names with commas between them, got 'l1,,l2'"),
-        ("design --theta1 60 --ratio 2 --bounds l1=1_0:2_0", "bounds must be NAME=A:B, got 'l1=1_0:2_0'"),
+        ("design --theta1 60 --branch in-phase --ratio 2", "branch must go with period or kappa, "
+                                                           "got 'in-phase'"),
+        ("design --theta1 60 --ratio 2 --free l1,,l2", "free must be names with commas between "
+                                                       "them, got 'l1,,l2'"),
+        ("design --theta1 60 --ratio 2 --bounds l1=1_0:2_0", "bounds must be NAME=A:B, got "
+                                                             "'l1=1_0:2_0'"),
         ("fit data.csv --free ,", "free must be names with commas between them, got ','"),
         ("fit data.csv", "data must be a CSV file that can be read, got data.csv"),
         ("fit data.png --figure data.png", "figure must be another file than data"),
         ("fit data.png --figure ./data.png", "figure must be another file than data"),
         ("atlas --max-period 1 --out s.json --store s.json", "out must be another file than store"),
-        ("simulate --theta1 40 --theta2 10 --duration 1 --most-steps 0", "most_steps must be an integer of at least 1"),
-        ("simulate --theta1 40 --theta2 10 --duration 1 --step 0.1 --most-steps 5", "step must make at most 5 steps"),
-        ("animate --theta1 9 --theta2 9 --duration 1 --out f.gif --l1 1e300 --l2 1e300", "duration must take at most"),
+        ("simulate --theta1 40 --theta2 10 --duration 1 --most-steps 0", "most_steps must be an "
+                                                                         "integer of at least 1"),
+        ("simulate --theta1 40 --theta2 10 --duration 1 --step 0.1 --most-steps 5", "step must "
+                                                                                    "make at most "
+                                                                                    "5 steps"),
+        ("animate --theta1 9 --theta2 9 --duration 1 --out f.gif --l1 1e300 --l2 1e300", "duration "
+                                                                                         "must "
+                                                                                         "take at "
+                                                                                         "most"),
     ],
 )  # fmt: skip
-def test_what_has_no_effect_or_two_meanings_is_refused(capsys, monkeypatch, tmp_path, arguments, line):
+def test_what_has_no_effect_or_two_meanings_is_refused(
+    capsys, monkeypatch, tmp_path, arguments, line
+):
     import re
 
     monkeypatch.chdir(tmp_path)
@@ -527,7 +700,9 @@ EXTREMES = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [*EXTREMES, "--g 0", "--g -9.8", "--l1 1e-300 --l2 1e-300", "--m1 1e300"])
+@pytest.mark.parametrize(
+    "options", [*EXTREMES, "--g 0", "--g -9.8", "--l1 1e-300 --l2 1e-300", "--m1 1e300"]
+)
 @pytest.mark.parametrize(
     "command",
     [
@@ -552,20 +727,26 @@ def test_an_extreme_pendulum_is_computed_or_told(capsys, monkeypatch, tmp_path, 
 
 
 def _write_data(place):
-    """Three seconds of a motion with noise of half a degree: of both rods, and of the upper one alone."""
+    """Three seconds of a motion with noise of half a degree: of both rods, and of the upper one
+    alone.
+    """
     motion = dpend.simulate(dpend.Pendulum(), dpend.released(1.0, 0.5), 3.0, step=0.02, error=False)
     noise = np.random.default_rng(0).normal(scale=0.5, size=(2, motion.time.size))
     angles = np.degrees([motion.state.theta1, motion.state.theta2]) + noise
     rows = list(zip(np.asarray(motion.time), *angles, strict=True))
     both = "\n".join(f"{t:.3f},{a:.4f},{b:.4f}" for t, a, b in rows)
     (place / "data.csv").write_text("time_s,theta1_deg,theta2_deg\n" + both)
-    (place / "one.csv").write_text("time_s,theta1_deg\n" + "\n".join(f"{t:.3f},{a:.4f}" for t, a, _ in rows))
+    (place / "one.csv").write_text(
+        "time_s,theta1_deg\n" + "\n".join(f"{t:.3f},{a:.4f}" for t, a, _ in rows)
+    )
     changed = "\n".join(f"{t:.3f},{a * (1 if t < 1.5 else 0.0175):.4f},{b:.4f}" for t, a, b in rows)
     (place / "changed.csv").write_text("time_s,theta1_deg,theta2_deg\n" + changed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", ["--noise 1e-12", "--noise 90", "--l2 1e-6 --m2 1e6", "--g -9.8 --at-rest"])
+@pytest.mark.parametrize(
+    "options", ["--noise 1e-12", "--noise 90", "--l2 1e-6 --m2 1e6", "--g -9.8 --at-rest"]
+)
 @pytest.mark.parametrize("data", ["data.csv", "one.csv", "changed.csv"])
 def test_a_fit_of_what_cannot_be_says_so(capsys, monkeypatch, tmp_path, data, options):
     monkeypatch.chdir(tmp_path)
@@ -585,6 +766,11 @@ def test_a_noise_that_no_angle_has_is_refused(capsys, monkeypatch, tmp_path):
         assert (status, out, err.count("\n")) == (2, "", 1)
         assert "noise must be from 1e-15 rad" in err
         assert noise.replace("1e3", "1e+3") in err
-    (tmp_path / "data.csv").write_text("time_s,theta1_deg,theta2_deg,theta2_deg\n" + rows.replace("\n", ",0\n") + ",0")
+    (tmp_path / "data.csv").write_text(
+        "time_s,theta1_deg,theta2_deg,theta2_deg\n" + rows.replace("\n", ",0\n") + ",0"
+    )
     status, _, err = run(capsys, "fit", "data.csv")
-    assert (status, err) == (2, "dpend: data.csv must have one column theta2_deg, got 2: keep one of them\n")
+    assert (status, err) == (
+        2,
+        "dpend: data.csv must have one column theta2_deg, got 2: keep one of them\n",
+    )

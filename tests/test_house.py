@@ -1,4 +1,6 @@
-"""The house rules: the wings in reading order, no private name through a door, heavy packages where they are used."""
+"""The house rules: the wings in reading order, no private name through a door, heavy packages where
+they are used.
+"""
 
 import ast
 import subprocess
@@ -8,7 +10,8 @@ from pathlib import Path
 
 import dpend
 
-# Reading order. A file imports only files before it: those of the wings above, and those before it in its own wing.
+# Reading order. A file imports only files before it: those of the wings above, and those before it
+# in its own wing.
 # The public names, `dpend` itself, come last but for the doors, which draw, print and serve.
 ORDER = """
 _version _runtime checks status records
@@ -17,10 +20,11 @@ methods.runge_kutta methods.circle methods.gauss methods.scheme
 motion.integrate motion.estimate motion.simulate motion.reference motion.events motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.store maps.layout maps.sweep
-orbits.stability orbits.arc orbits.newton orbits.single orbits.walk orbits.curve orbits.follow orbits.orbit
-orbits.samples orbits.crossings orbits.special orbits.find orbits.family
+orbits.stability orbits.arc orbits.newton orbits.single orbits.walk orbits.curve orbits.follow
+orbits.orbit orbits.samples orbits.crossings orbits.special orbits.find orbits.family
 catalogue.bicubic catalogue.scan catalogue.files catalogue.atlas catalogue.track catalogue.survey
-inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.fit inverse.nearest inverse.design
+inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.fit inverse.nearest
+inverse.design
 dpend
 plots animate report cli
 """.split()
@@ -37,7 +41,9 @@ def name_of(path: Path) -> str:
 
 def files() -> dict[str, Path]:
     """All files of the package but the `__init__`s of the wings, the package's own as `dpend`."""
-    found = {name_of(path): path for path in sorted(HOUSE.rglob("*.py")) if path.name != "__init__.py"}
+    found = {
+        name_of(path): path for path in sorted(HOUSE.rglob("*.py")) if path.name != "__init__.py"
+    }
     return {**found, "dpend": HOUSE / "__init__.py"}
 
 
@@ -48,10 +54,18 @@ def imported(path: Path) -> Iterator[tuple[str, str | None]]:
             for alias in node.names:
                 if alias.name.split(".")[0] == "dpend":
                     yield alias.name.removeprefix("dpend."), None
-        elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "dpend":
+        elif (
+            isinstance(node, ast.ImportFrom)
+            and node.module
+            and node.module.split(".")[0] == "dpend"
+        ):
             for alias in node.names:
                 whole = f"{node.module}.{alias.name}".removeprefix("dpend.")
-                yield (whole, None) if whole in ORDER else (node.module.removeprefix("dpend."), alias.name)
+                yield (
+                    (whole, None)
+                    if whole in ORDER
+                    else (node.module.removeprefix("dpend."), alias.name)
+                )
 
 
 def test_every_file_has_its_place():
@@ -60,7 +74,9 @@ def test_every_file_has_its_place():
 
 def test_wings_have_empty_doors():
     doors = [path for path in HOUSE.rglob("__init__.py") if path.parent != HOUSE]
-    assert {path.parent.name for path in doors} == {name.split(".")[0] for name in ORDER if "." in name}
+    assert {path.parent.name for path in doors} == {
+        name.split(".")[0] for name in ORDER if "." in name
+    }
     assert [path for path in doors if path.read_text()] == []
 
 
@@ -86,7 +102,11 @@ def test_no_private_name_passes_through_a_door():
 
 def test_only_the_command_line_prints():
     def prints(path):
-        calls = (node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+        calls = (
+            node.func
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Call)
+        )
         return any(isinstance(function, ast.Name) and function.id == "print" for function in calls)
 
     assert sorted(name for name, path in files().items() if prints(path)) == PRINTING

@@ -62,21 +62,29 @@ def test_orbit_sheet_shows_whole_orbits(paper):
 @pytest.mark.slow
 def test_a_map_shows_its_cells_and_the_line_no_flip_crosses(paper):
     side = np.pi * (np.arange(10) + 0.5 - 5) / 5
-    field = dpend.sweep(partial(dpend.chaos.flip, duration=1.0), paper, {"theta1": side, "theta2": side})
+    field = dpend.sweep(
+        partial(dpend.chaos.flip, duration=1.0), paper, {"theta1": side, "theta2": side}
+    )
     ax = plots.map_of(field)
     mesh, line = ax.collections[0], ax.collections[1]
     shown = np.ma.filled(mesh.get_array(), np.nan).reshape(10, 10)
     expected = np.where(np.isfinite(field.flip_time.values), field.flip_time.values, np.nan).T
     np.testing.assert_array_equal(shown, expected)
     on_line = np.radians(np.concatenate([path.vertices for path in line.get_paths()]))
-    assert np.max(np.abs(2 * np.cos(on_line[:, 0]) + np.cos(on_line[:, 1]) - 1)) < 0.15  # of a coarse grid
+    assert (
+        np.max(np.abs(2 * np.cos(on_line[:, 0]) + np.cos(on_line[:, 1]) - 1)) < 0.15
+    )  # of a coarse grid
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("theta1 (deg)", "theta2 (deg)")
-    with pytest.raises(ValueError, match="name must be one of bob, flip_time, steps, status, got 'flips'"):
+    with pytest.raises(
+        ValueError, match="name must be one of bob, flip_time, steps, status, got 'flips'"
+    ):
         plots.map_of(field, "flips")
 
 
 def test_a_family_is_solid_where_it_is_stable(paper):
-    """The solid line ends at the last stable orbit before stability is lost, and every special point has its mark."""
+    """The solid line ends at the last stable orbit before stability is lost, and every special
+    point has its mark.
+    """
     family = dpend.follow_family(paper, "anti-phase")
     ax = plots.family(family, plane="period")
     whole, solid, *marks = ax.lines

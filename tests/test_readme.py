@@ -17,8 +17,13 @@ from dpend import cli
 
 HOUSE = Path(__file__).parent.parent
 README = HOUSE / "README.md"
-# Fences in order: the language, what is in it, and where a block of text follows at once, that: what it prints.
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```\n(?:\n?```text\n(.*?)^```\n)?", README.read_text(), re.DOTALL | re.MULTILINE)
+# Fences in order: the language, what is in it, and where a block of text follows at once, that:
+# what it prints.
+BLOCKS = re.findall(
+    r"^```(\w+)\n(.*?)^```\n(?:\n?```text\n(.*?)^```\n)?",
+    README.read_text(),
+    re.DOTALL | re.MULTILINE,
+)
 # A line of a shell block; comments are for people.
 COMMANDS = [
     (shlex.split(line.split("dpend ", 1)[1], comments=True), printed)
@@ -27,9 +32,12 @@ COMMANDS = [
     for line in code.splitlines()
     if re.search(r"(^|/)dpend ", line)
 ]
-# In running text: `dpend family --branch in-phase`; not `dpend map lyapunov|megno`, which stands for four.
+# In running text: `dpend family --branch in-phase`; not `dpend map lyapunov|megno`, which stands
+# for four.
 SPANS = [shlex.split(span) for span in re.findall(r"`dpend (\w+ --[^`|]+)`", README.read_text())]
-SCRIPTS = re.findall(r"`python experiments/(\w+\.py)", (HOUSE / "experiments" / "README.md").read_text())
+SCRIPTS = re.findall(
+    r"`python experiments/(\w+\.py)", (HOUSE / "experiments" / "README.md").read_text()
+)
 
 
 def run(capsys, arguments):
@@ -64,7 +72,9 @@ def test_all_python_runs_in_order(capsys, tmp_path, monkeypatch):
             line = next(line for line in code.splitlines() if "--out data.csv" in line)
             assert cli._run(shlex.split(line, comments=True)[1:]) == 0
         elif language == "python":
-            exec(compile(code, "<README>", "exec"), names)  # no file of that name: quantities have no source
+            exec(
+                compile(code, "<README>", "exec"), names
+            )  # no file of that name: quantities have no source
     assert names["atlas"].table["period"].size > 1000
     assert {orbit.stability for orbit in names["stable"].orbits} == {"elliptic"}
     assert int(names["found"].status) == 0
@@ -100,7 +110,9 @@ NUMBER = r"[+-]?\d+\.?\d*(?:e[+-]?\d+)?"
 
 
 def assert_shown(shown, out):
-    """The shown lines begin the output: words as they are, numbers to their last place, errors of rounding as such."""
+    """The shown lines begin the output: words as they are, numbers to their last place, errors of
+    rounding as such.
+    """
     for ours, theirs in zip(shown.splitlines(), out.splitlines(), strict=False):
         assert re.sub(NUMBER, "#", ours.rstrip()) == re.sub(NUMBER, "#", theirs.rstrip())
         for a, b in zip(re.findall(NUMBER, ours), re.findall(NUMBER, theirs), strict=True):
@@ -111,7 +123,11 @@ def assert_shown(shown, out):
 
 def test_a_shown_digit_that_is_wrong_is_seen():
     assert_shown("theta2 = 49.0665 deg, 4e-13", "theta2 = 49.0665 deg, 2e-12\nmore")
-    for wrong in ("theta2 = 49.0675 deg, 4e-13", "theta2 = 49.0665 rad, 4e-13", "theta2 = 49.0665 deg, 4e-3"):
+    for wrong in (
+        "theta2 = 49.0675 deg, 4e-13",
+        "theta2 = 49.0665 rad, 4e-13",
+        "theta2 = 49.0665 deg, 4e-3",
+    ):
         with pytest.raises(AssertionError):
             assert_shown("theta2 = 49.0665 deg, 4e-13", wrong)
 
@@ -132,15 +148,21 @@ def test_the_table_of_speeds_is_made_of_the_measured_rows():
 @pytest.mark.slow
 @pytest.mark.parametrize("script", sorted(set(SCRIPTS)))
 def test_every_experiment_runs(tmp_path, script):
-    """In a copy, as what they write lies beside them. No row of the hard cases fails but the one whose page says so."""
+    """In a copy, as what they write lies beside them. No row of the hard cases fails but the one
+    whose page says so.
+    """
     place = tmp_path / "experiments"
-    shutil.copytree(HOUSE / "experiments", place, ignore=shutil.ignore_patterns("__pycache__", "paper"))
+    shutil.copytree(
+        HOUSE / "experiments", place, ignore=shutil.ignore_patterns("__pycache__", "paper")
+    )
     shutil.copy(README, tmp_path)
     if re.search(r"^import heyoka", (place / script).read_text(), re.MULTILINE):
         pytest.importorskip("heyoka")
     command = [sys.executable, place / script, "--quick"]
     environment = {"PYTHONPATH": str(HOUSE), "MPLBACKEND": "Agg"}
-    done = subprocess.run(command, cwd=tmp_path, env={**os.environ, **environment}, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=tmp_path, env={**os.environ, **environment}, capture_output=True, text=True
+    )
     failed = re.findall(r"^ *\d+  fails .*$", done.stdout, re.MULTILINE)
     assert all("gauss" in row and "trend of the energy" in row for row in failed), failed
     assert done.returncode == bool(failed), done.stderr

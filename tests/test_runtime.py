@@ -15,9 +15,16 @@ from dpend import _runtime
 
 def run(code, **environment):
     """The JSON that `code` prints, in a fresh interpreter whose JAX variables are those given."""
-    clean = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_", "DPEND_"))}
+    clean = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("JAX_", "XLA_", "DPEND_"))
+    }
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, env=clean | environment
+        [sys.executable, "-W", "error", "-c", code],
+        capture_output=True,
+        text=True,
+        env=clean | environment,
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -83,22 +90,30 @@ import dpend
 paper = dpend.Pendulum()
 orbits = [dpend.find_orbit(paper, np.radians(40.0), branch=b) for b in ("in-phase", "anti-phase")]
 end = dpend.flow(paper, dpend.released(2.0, 1.0), 2.0, dpend.Scheme("rk8", 5e-3))
-print(json.dumps([[float(o.theta2), float(o.period)] for o in orbits] + [[float(end.theta1), float(end.theta2)]]))
+found = [[float(o.theta2), float(o.period)] for o in orbits]
+print(json.dumps(found + [[float(end.theta1), float(end.theta2)]]))
 """
     with_options, without = run(code), run(code, DPEND_PLAIN_JAX="1", JAX_ENABLE_X64="1")
     np.testing.assert_allclose(with_options, without, rtol=1e-12)
 
 
-@pytest.mark.parametrize("flags", ["--xla_no_such_flag=1", "--xla_cpu_enable_fast_math=perhaps", "no such file"])
+@pytest.mark.parametrize(
+    "flags", ["--xla_no_such_flag=1", "--xla_cpu_enable_fast_math=perhaps", "no such file"]
+)
 def test_flags_that_would_end_the_process_are_refused(monkeypatch, flags):
     """XLA itself says so, in a process of its own."""
     monkeypatch.setenv("XLA_FLAGS", flags)
-    with pytest.raises(RuntimeError, match=re.escape(f"that the installed XLA knows, got '{flags}'")):
+    with pytest.raises(
+        RuntimeError, match=re.escape(f"that the installed XLA knows, got '{flags}'")
+    ):
         _runtime._check_flags()
 
 
 def test_flags_that_xla_knows_pass(monkeypatch):
-    for flags in ("", "--xla_force_host_platform_device_count=2 --xla_cpu_enable_fast_min_max=false"):
+    for flags in (
+        "",
+        "--xla_force_host_platform_device_count=2 --xla_cpu_enable_fast_min_max=false",
+    ):
         monkeypatch.setenv("XLA_FLAGS", flags)
         _runtime._check_flags()
 
@@ -116,21 +131,37 @@ SIMULATE = "simulate --theta1 40 --theta2 10 --duration 1 --step 0.05"
         ({"JAX_PLATFORMS": "abacus"}, SIMULATE, 1, "'abacus'"),
         ({"JAX_COMPILATION_CACHE_DIR": "/proc/nowhere"}, SIMULATE, 0, ""),
         ({"XDG_CACHE_HOME": "not/absolute"}, SIMULATE, 0, ""),
-        ({"MPLBACKEND": "nonsense"}, "animate --theta1 1 --theta2 1 --duration 0.1 --out f.gif", 0, ""),
+        (
+            {"MPLBACKEND": "nonsense"},
+            "animate --theta1 1 --theta2 1 --duration 0.1 --out f.gif",
+            0,
+            "",
+        ),
         ({"COLUMNS": "1", "TERM": "dumb", "NO_COLOR": "1"}, SIMULATE, 0, ""),
         ({"COLUMNS": "0"}, "orbit --help", 0, ""),
         ({"PYTHONWARNINGS": "error"}, SIMULATE, 0, ""),
         ({"PYTHONOPTIMIZE": "2"}, SIMULATE, 0, ""),
-        ({"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}, "orbit --theta1 40 --branch in-phase", 0, ""),
+        (
+            {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"},
+            "orbit --theta1 40 --branch in-phase",
+            0,
+            "",
+        ),
     ],
     ids=str,
 )
 def test_the_program_in_a_strange_environment(tmp_path, environment, command, status, line):
     house = str(Path(_runtime.__file__).parents[1])
-    clean = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_", "DPEND_"))}
+    clean = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("JAX_", "XLA_", "DPEND_"))
+    }
     clean |= {"PYTHONPATH": house, "HOME": str(tmp_path)}
     program = [sys.executable, "-m", "dpend.cli", *command.split()]
-    done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, env=clean | environment)
+    done = subprocess.run(
+        program, cwd=tmp_path, capture_output=True, text=True, env=clean | environment
+    )
     assert done.returncode == status, done.stderr
     assert done.stderr.count("\n") == (status != 0)
     assert line in done.stderr
@@ -139,9 +170,14 @@ def test_the_program_in_a_strange_environment(tmp_path, environment, command, st
 
 @pytest.mark.slow
 def test_output_that_nobody_takes(tmp_path):
-    """A full disk is told in a line; a reader that has gone, and Ctrl-C while everything is imported, in none."""
+    """A full disk is told in a line; a reader that has gone, and Ctrl-C while everything is
+    imported, in none.
+    """
     house = str(Path(_runtime.__file__).parents[1])
-    program = {"args": [sys.executable, "-m", "dpend.cli", "--help"], "env": os.environ | {"PYTHONPATH": house}}
+    program = {
+        "args": [sys.executable, "-m", "dpend.cli", "--help"],
+        "env": os.environ | {"PYTHONPATH": house},
+    }
     with open("/dev/full", "w") as full:
         done = subprocess.run(**program, stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
@@ -151,6 +187,11 @@ def test_output_that_nobody_takes(tmp_path):
     done = subprocess.run(**program, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert (done.returncode, done.stderr) == (141, "")
-    code = "import os, signal, sys; sys.argv = ['dpend']; import dpend; os.kill(os.getpid(), signal.SIGINT)"
-    done = subprocess.run([sys.executable, "-c", code], env=program["env"], capture_output=True, text=True)
+    code = (
+        "import os, signal, sys; sys.argv = ['dpend']; import dpend; os.kill(os.getpid(), "
+        "signal.SIGINT)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=program["env"], capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (130, "")

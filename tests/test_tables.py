@@ -16,7 +16,18 @@ def test_no_time_and_no_error_is_negative(path):
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert rows
-    words = ("second", "first", "call", "_s", "fastest", "slowest", "total", "rate", "memory", "error")
+    words = (
+        "second",
+        "first",
+        "call",
+        "_s",
+        "fastest",
+        "slowest",
+        "total",
+        "rate",
+        "memory",
+        "error",
+    )
     for name in rows[0]:
         if any(word in name for word in words) and name != "error_bound":
             values = [float(row[name]) for row in rows]
@@ -26,7 +37,9 @@ def test_no_time_and_no_error_is_negative(path):
 def test_a_first_call_is_not_shorter_than_what_it_compiles():
     """It compiles and runs once: it takes longer than the fastest warm call, up to noise."""
     with next(path for path in TABLES if path.name == "cost_growth.csv").open(newline="") as file:
-        assert all(float(row["first_call_s"]) > 0.8 * float(row["seconds"]) for row in csv.DictReader(file))
+        assert all(
+            float(row["first_call_s"]) > 0.8 * float(row["seconds"]) for row in csv.DictReader(file)
+        )
 
 
 @pytest.mark.parametrize(
@@ -43,8 +56,16 @@ def test_a_first_call_is_not_shorter_than_what_it_compiles():
 )
 def test_digits_end_where_the_error_begins(value, error, text):
     assert show(value, error) == text
-    assert error == 0 or abs(float(text) - value) <= 0.5 * 10.0 ** math.floor(math.log10(round_up(error)))
+    assert error == 0 or abs(float(text) - value) <= 0.5 * 10.0 ** math.floor(
+        math.log10(round_up(error))
+    )
 
 
 def test_a_bound_goes_up_to_one_digit():
-    assert [round_up(x) for x in (1e-10, 1.01e-10, 9.5e-3, 0.05, 0.0)] == [1e-10, 2e-10, 1e-2, 0.05, 0.0]
+    assert [round_up(x) for x in (1e-10, 1.01e-10, 9.5e-3, 0.05, 0.0)] == [
+        1e-10,
+        2e-10,
+        1e-2,
+        0.05,
+        0.0,
+    ]

@@ -1,7 +1,8 @@
-"""The atlas: every brake orbit of one release angle up to a period, and the table and file of many orbits.
+"""The atlas: every brake orbit of one release angle up to a period, and the table and file of many
+orbits.
 
-`scan` finds all returns to rest, `find_orbit` solves them to rounding. An `Atlas` is a table with what was done to find
-its rows; those of families over the whole square come from `survey`.
+`scan` finds all returns to rest, `find_orbit` solves them to rounding. An `Atlas` is a table with
+what was done to find its rows; those of families over the whole square come from `survey`.
 """
 
 import csv
@@ -16,7 +17,14 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.catalogue.files import COLUMNS, UNITS, file_name, file_values, pendulum_record, read_catalogue
+from dpend.catalogue.files import (
+    COLUMNS,
+    UNITS,
+    file_name,
+    file_values,
+    pendulum_record,
+    read_catalogue,
+)
 from dpend.catalogue.scan import (
     MOTIONS_PER_WAVE,
     RETURNS_PER_WAVE,
@@ -28,7 +36,16 @@ from dpend.catalogue.scan import (
     longest,
     scanned,
 )
-from dpend.checks import check_place, file_path, function, known_number, known_real, one_of, several, shown
+from dpend.checks import (
+    check_place,
+    file_path,
+    function,
+    known_number,
+    known_real,
+    one_of,
+    several,
+    shown,
+)
 from dpend.mechanics.pendulum import Pendulum, released
 from dpend.mechanics.trig import LARGEST_ANGLE
 from dpend.mechanics.units import natural
@@ -44,10 +61,12 @@ _INTERVALS, _MOST_REFINEMENTS = 128, 6
 MOST_SEARCH_STEPS, STEPS_PER_ORBIT, SECONDS_PER_STEP = 300_000_000, 10_000, 4e-6
 # Larger numbers are not counted.
 COUNTABLE = 10**18
-# Powers of ten. A lower bob of 1e-200 of the upper one's mass takes products of momenta below what float64 holds;
-# with a lower rod of 1e-28 of the upper one its own momentum is lost in what the upper one adds to it.
+# Powers of ten. A lower bob of 1e-200 of the upper one's mass takes products of momenta below what
+# float64 holds; with a lower rod of 1e-28 of the upper one its own momentum is lost in what the
+# upper one adds to it.
 _FARTHEST_MASSES, _FARTHEST_LENGTHS, _FARTHEST_UNIT = 30, 12, 90
-# A scan looks this share further than asked, so that an orbit of just the longest period lies inside.
+# A scan looks this share further than asked, so that an orbit of just the longest period lies
+# inside.
 BEYOND = 1e-3
 
 
@@ -58,17 +77,19 @@ class Coverage:
     Attributes:
         theta2_points: motions that were integrated by the last scan, or by those of all slices.
         time_points: rows in time at which each was looked at.
-        refinements: how often the intervals of theta2 were doubled; of the whole square how often the slices were.
-        suspicious_cells: places where something may be missing: intervals of theta2 too narrow to halve; returns to
-            rest that Newton's method did not confirm; by how much `winding` and `degree` differ, slice by slice;
-            returns or families that the last refinements still changed; of the whole square also passages of families
-            that no return answers to, and returns that no passage does.
-        winding, degree: how often p at the last time goes round zero as theta2 goes round, and the sum of the signs of
-            all returns found, those of orbits run through several times included: unequal if one is missing. Of several
-            slices their sums.
+        refinements: how often the intervals of theta2 were doubled; of the whole square how often
+            the slices were.
+        suspicious_cells: places where something may be missing: intervals of theta2 too narrow to
+            halve; returns to rest that Newton's method did not confirm; by how much `winding` and
+            `degree` differ, slice by slice; returns or families that the last refinements still
+            changed; of the whole square also passages of families that no return answers to, and
+            returns that no passage does.
+        winding, degree: how often p at the last time goes round zero as theta2 goes round, and the
+            sum of the signs of all returns found, those of orbits run through several times
+            included: unequal if one is missing. Of several slices their sums.
         slices: release angles that were scanned.
-        exhausted: whether the search was broken off because it would have taken more than was allowed: what was found
-            is right, and more is likely to be missing.
+        exhausted: whether the search was broken off because it would have taken more than was
+            allowed: what was found is right, and more is likely to be missing.
     """
 
     theta2_points: int
@@ -88,10 +109,11 @@ class Atlas:
     Attributes:
         pendulum: theirs.
         max_period: how far was looked [s].
-        table: columns by name, shape (n,), in radians and SI units: `family` (empty for a single release angle) and
-            `arclength` along it; `theta1`, `theta2`, `period`, `energy`, `kappa`, `log_abs_kappa`, `symmetry`,
-            `residual`, `iterations` and `status` as in `PeriodicOrbit`, and from there `dual_theta1`, `dual_theta2`,
-            `turns1`, `turns2`, `theta2_error`, `period_error`.
+        table: columns by name, shape (n,), in radians and SI units: `family` (empty for a single
+            release angle) and `arclength` along it; `theta1`, `theta2`, `period`, `energy`,
+            `kappa`, `log_abs_kappa`, `symmetry`, `residual`, `iterations` and `status` as in
+            `PeriodicOrbit`, and from there `dual_theta1`, `dual_theta2`, `turns1`, `turns2`,
+            `theta2_error`, `period_error`.
         families: a record for each, see `find_brake_families`; none for a single release angle.
         coverage: how they were found.
     """
@@ -120,10 +142,12 @@ class Atlas:
         symmetry: Any = None,
         family: Any = None,
     ) -> "Atlas":
-        """The rows with period [s], energy [J] and kappa in closed ranges, of a symmetry, of one family or of several.
+        """The rows with period [s], energy [J] and kappa in closed ranges, of a symmetry, of one
+        family or of several.
 
         Raises:
-            ValueError: a range that is none; an unknown symmetry, or a family that the atlas does not have.
+            ValueError: a range that is none; an unknown symmetry, or a family that the atlas does
+                not have.
         """
         keep = np.ones(len(self), bool)
         for name, bounds in (("period", period), ("energy", energy), ("kappa", kappa)):
@@ -131,7 +155,10 @@ class Atlas:
                 low, high = _range(name, bounds)
                 keep &= (self.table[name] >= low) & (self.table[name] <= high)
         names = [one["family"] for one in self.families]
-        for name, wanted, known in (("symmetry", symmetry, list(RELEASED_SYMMETRIES)), ("family", family, names)):
+        for name, wanted, known in (
+            ("symmetry", symmetry, list(RELEASED_SYMMETRIES)),
+            ("family", family, names),
+        ):
             if wanted is not None:
                 given = list(wanted) if isinstance(wanted, (list, tuple, set)) else [wanted]
                 chosen = [one_of(name, one, sorted(known)) for one in given]
@@ -139,7 +166,9 @@ class Atlas:
         return replace(self, table={key: column[keep] for key, column in self.table.items()})
 
     def record(self) -> dict[str, Any]:
-        """All of it as plain numbers and text, angles in degrees: what `save` writes and `--json` prints."""
+        """All of it as plain numbers and text, angles in degrees: what `save` writes and `--json`
+        prints.
+        """
         columns = {file_name(key): file_values(key, column) for key, column in self.table.items()}
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         for row in rows:
@@ -148,10 +177,11 @@ class Atlas:
         return {**self._about(), "orbits": rows}
 
     def save(self, path: str | os.PathLike[str] | Any) -> None:
-        """Writes F.json, or F.csv whose first line is a comment with all but the table, to be read by `load_atlas`.
+        """Writes F.json, or F.csv whose first line is a comment with all but the table, to be read
+        by `load_atlas`.
 
-        Angles in degrees, which may cost their last bit, everything else as it is. How many digits of theta2 and the
-        period are to be trusted, the columns with their errors say.
+        Angles in degrees, which may cost their last bit, everything else as it is. How many digits
+        of theta2 and the period are to be trusted, the columns with their errors say.
 
         Raises:
             ValueError: another ending; no directory to write in.
@@ -178,25 +208,35 @@ class Atlas:
         """An orbit a line: files are read by people and compared by lines, too."""
         record = self.record()
         lines = (json_text(orbit, indent=None) for orbit in record.pop("orbits"))
-        return json_text(record).removesuffix("\n}") + ',\n  "orbits": [\n    ' + ",\n    ".join(lines) + "\n  ]\n}\n"
+        return (
+            json_text(record).removesuffix("\n}")
+            + ',\n  "orbits": [\n    '
+            + ",\n    ".join(lines)
+            + "\n  ]\n}\n"
+        )
 
     def _csv(self) -> str:
         text = io.StringIO()
         text.write("# " + json_text(self._about(), indent=None) + "\n")
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([file_name(key) for key in self.table])
-        writer.writerows(zip(*(file_values(key, column) for key, column in self.table.items()), strict=True))
+        writer.writerows(
+            zip(*(file_values(key, column) for key, column in self.table.items()), strict=True)
+        )
         return text.getvalue()
 
 
 def load_atlas(path: str | os.PathLike[str] | Any) -> Atlas:
-    """The atlas that `Atlas.save` wrote to F.json or F.csv, every row held to what is true of orbits.
+    """The atlas that `Atlas.save` wrote to F.json or F.csv, every row held to what is true of
+    orbits.
 
-    Energies, kappa and its logarithm, both rests of a centred orbit and neighbours on a family have to agree, so that a
-    file that was damaged on its way is refused; a row whose status is another than `converged` need not agree.
+    Energies, kappa and its logarithm, both rests of a centred orbit and neighbours on a family have
+    to agree, so that a file that was damaged on its way is refused; a row whose status is another
+    than `converged` need not agree.
 
     Raises:
-        ValueError: no such file, or one that holds no atlas: with the row, the column and what is wrong.
+        ValueError: no such file, or one that holds no atlas: with the row, the column and what is
+            wrong.
     """
     path = file_path("path", path)
     if path.suffix not in (".csv", ".json"):
@@ -205,7 +245,8 @@ def load_atlas(path: str | os.PathLike[str] | Any) -> Atlas:
         pendulum, max_period, table, families, coverage = read_catalogue(path)
     except OSError as error:
         raise ValueError(
-            f"path must be a file that can be read, got {path} ({error.strerror}): give another file"
+            f"path must be a file that can be read, got {path} ({error.strerror}): give another "
+            f"file"
         ) from None
     except ValueError as error:
         raise ValueError(
@@ -226,7 +267,10 @@ def table_of(orbits: PeriodicOrbit, family: str, arclength: Any) -> dict[str, np
         "theta2_error": orbits.error_estimate[0],
         "period_error": orbits.error_estimate[1],
     }
-    columns |= {key: getattr(orbits, key) for key in ("period", "energy", "kappa", "log_abs_kappa", "residual")}
+    columns |= {
+        key: getattr(orbits, key)
+        for key in ("period", "energy", "kappa", "log_abs_kappa", "residual")
+    }
     columns |= {"iterations": orbits.iterations, "status": orbits.status, "arclength": arclength}
     count = len(np.asarray(orbits.period))
     columns |= {"family": np.full(count, family), "symmetry": np.full(count, orbits.symmetry)}
@@ -264,10 +308,13 @@ def _range(name: str, bounds: Any) -> tuple[float, float]:
     try:
         low, high = (known_real(name, bound) for bound in pair)
     except ValueError:
-        raise ValueError(f"{name} must be a pair (low, high) of numbers, got {shown(bounds)}: give two") from None
+        raise ValueError(
+            f"{name} must be a pair (low, high) of numbers, got {shown(bounds)}: give two"
+        ) from None
     if not low <= high:
         raise ValueError(
-            f"{name} must be a pair (low, high) with low at most high, got {shown(bounds)}: give them in order"
+            f"{name} must be a pair (low, high) with low at most high, got {shown(bounds)}: give "
+            f"them in order"
         )
     return low, high
 
@@ -280,27 +327,32 @@ def find_brake_orbits(
     most_steps: Any = MOST_SEARCH_STEPS,
     progress: Callable[[int, int], None] | Any | None = None,
 ) -> Atlas:
-    """Every orbit released from rest at `theta1` with a period of at most `max_period`: all its partners theta2.
+    """Every orbit released from rest at `theta1` with a period of at most `max_period`: all its
+    partners theta2.
 
-    The returns to rest are all zeros of (p1, p2) in (theta2, t), found cell by cell (see `scan`). The scan is repeated
-    from twice as many intervals of theta2 until the number of returns has stood through two repetitions; then each
-    return is solved by `find_orbit`. An orbit run through several times is listed once with its minimal period; where
-    theta1 is 0 or 180 degrees, so is one of each pair of mirror images (theta1, theta2) and (theta1, -theta2). Where
-    both rests of an orbit, or one and the mirror image of the other, have theta1, both are listed, being two releases.
+    The returns to rest are all zeros of (p1, p2) in (theta2, t), found cell by cell (see `scan`).
+    The scan is repeated from twice as many intervals of theta2 until the number of returns has
+    stood through two repetitions; then each return is solved by `find_orbit`. An orbit run through
+    several times is listed once with its minimal period; where theta1 is 0 or 180 degrees, so is
+    one of each pair of mirror images (theta1, theta2) and (theta1, -theta2). Where both rests of an
+    orbit, or one and the mirror image of the other, have theta1, both are listed, being two
+    releases.
 
     Arguments:
         pendulum: its fields are numbers; g positive.
         theta1: release angle of the upper rod [rad].
         max_period: [s]. The number of orbits, and the time it takes, grows exponentially with it.
-        most_steps: time steps of all motions, 2 to 8 microseconds each on one core. A search that will take more is
-            refused before it begins; one that takes more after all ends there, and its coverage says `exhausted`.
+        most_steps: time steps of all motions, 2 to 8 microseconds each on one core. A search that
+            will take more is refused before it begins; one that takes more after all ends there,
+            and its coverage says `exhausted`.
         progress: called with the time steps so far, and with those that are expected in all.
     Returns:
         Atlas, in order of the period; theta2 in (-pi, pi].
     Raises:
-        ValueError: theta1 not finite, or beyond 1.3e7 rad; max_period not positive, or so long that the fast normal
-            mode would swing 32 times, or that most_steps are not enough; g not positive; a traced argument; lengths,
-            masses or g whose products leave the range of float64.
+        ValueError: theta1 not finite, or beyond 1.3e7 rad; max_period not positive, or so long that
+            the fast normal mode would swing 32 times, or that most_steps are not enough; g not
+            positive; a traced argument; lengths, masses or g whose products leave the range of
+            float64.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -326,7 +378,10 @@ def find_brake_orbits(
         theta2_points=result.motions,
         time_points=result.rows,
         refinements=refinement,
-        suspicious_cells=len(result.open_cells) + lost + abs(result.winding - result.degree) + unsettled,
+        suspicious_cells=len(result.open_cells)
+        + lost
+        + abs(result.winding - result.degree)
+        + unsettled,
         winding=result.winding,
         degree=result.degree,
         exhausted=budget.exhausted,
@@ -338,7 +393,8 @@ def _known_angle(theta1: Any) -> float:
     value = known_number("theta1", theta1, unit="rad")
     if abs(value) > LARGEST_ANGLE:
         raise ValueError(
-            f"theta1 must be at most {LARGEST_ANGLE:.2g} rad, beyond which its sine has no digits left, got {value:g}: "
+            f"theta1 must be at most {LARGEST_ANGLE:.2g} rad, beyond which its sine has no digits "
+            f"left, got {value:g}: "
             "take off full turns"
         )
     return value
@@ -350,34 +406,56 @@ def known_period(pendulum: Pendulum, max_period: Any) -> float:
     _check_scales(pendulum)
     most = 2 * longest(jax.tree.map(float, natural(pendulum))) * math.sqrt(pendulum.l1 / pendulum.g)
     if value > most:
-        raise ValueError(f"max_period must be at most {most:.4g} s for this pendulum, got {value:g}: ask for less")
+        raise ValueError(
+            f"max_period must be at most {most:.4g} s for this pendulum, got {value:g}: ask for "
+            f"less"
+        )
     return value
 
 
 def _check_scales(pendulum: Pendulum) -> None:
-    """Refuses a pendulum whose numbers are so far apart that their products leave the range of float64."""
-    l1, l2, m1, m2, g = (math.log10(float(getattr(pendulum, name))) for name in ("l1", "l2", "m1", "m2", "g"))
-    for names, ratio, most in (("l1 and l2", l2 - l1, _FARTHEST_LENGTHS), ("m1 and m2", m2 - m1, _FARTHEST_MASSES)):
+    """Refuses a pendulum whose numbers are so far apart that their products leave the range of
+    float64.
+    """
+    l1, l2, m1, m2, g = (
+        math.log10(float(getattr(pendulum, name))) for name in ("l1", "l2", "m1", "m2", "g")
+    )
+    for names, ratio, most in (
+        ("l1 and l2", l2 - l1, _FARTHEST_LENGTHS),
+        ("m1 and m2", m2 - m1, _FARTHEST_MASSES),
+    ):
         if abs(ratio) > most:
-            values = " and ".join(f"{float(getattr(pendulum, name)):g}" for name in names.split(" and "))
+            values = " and ".join(
+                f"{float(getattr(pendulum, name)):g}" for name in names.split(" and ")
+            )
             raise ValueError(
-                f"{names} must be within a factor of 1e{most} of each other, beyond which float64 loses the momenta, "
+                f"{names} must be within a factor of 1e{most} of each other, beyond which float64 "
+                f"loses the momenta, "
                 f"got {values}: give others"
             )
-    units = {"sqrt(l1/g)": 0.5 * (l1 - g), "m1 g l1": m1 + g + l1, "m1 l1 sqrt(g l1)": m1 + 1.5 * l1 + 0.5 * g}
+    units = {
+        "sqrt(l1/g)": 0.5 * (l1 - g),
+        "m1 g l1": m1 + g + l1,
+        "m1 l1 sqrt(g l1)": m1 + 1.5 * l1 + 0.5 * g,
+    }
     for name, size in units.items():
         if abs(size) > _FARTHEST_UNIT:
             raise ValueError(
-                f"{name} must be within 1e-{_FARTHEST_UNIT} and 1e{_FARTHEST_UNIT} in SI units, beyond which products "
+                f"{name} must be within 1e-{_FARTHEST_UNIT} and 1e{_FARTHEST_UNIT} in SI units, "
+                f"beyond which products "
                 f"leave the range of float64, got 1e{size:.0f}: use other units"
             )
 
 
 def expected_steps(pendulum: Pendulum, max_period: float, theta1: float) -> int:
-    """The time steps that `find_brake_orbits` will take, roughly: three scans, and the returns solved."""
+    """The time steps that `find_brake_orbits` will take, roughly: three scans, and the returns
+    solved.
+    """
     seen = foresee_returns(pendulum, theta1, max_period)
     motions = 2 * (_INTERVALS << 3) + 3 * MOTIONS_PER_WAVE * seen.waves
-    return int(min(motions * seen.rows + RETURNS_PER_WAVE * seen.waves * STEPS_PER_ORBIT, COUNTABLE))
+    return int(
+        min(motions * seen.rows + RETURNS_PER_WAVE * seen.waves * STEPS_PER_ORBIT, COUNTABLE)
+    )
 
 
 def foresee_returns(pendulum: Pendulum, theta1: float, max_period: float) -> Outlook:
@@ -390,8 +468,10 @@ def known_budget(most_steps: float, expected: int, max_period: float) -> Budget:
     """`most_steps`, refused if the search is expected to take more."""
     if most_steps < expected:
         raise ValueError(
-            f"max_period must be so short that most_steps, {most_steps:g}, are enough, got {max_period:g} s, which "
-            f"takes about {expected:.1g}, {expected * SECONDS_PER_STEP:.1g} s of time: ask for less, or raise "
+            f"max_period must be so short that most_steps, {most_steps:g}, are enough, got "
+            f"{max_period:g} s, which "
+            f"takes about {expected:.1g}, {expected * SECONDS_PER_STEP:.1g} s of time: ask for "
+            f"less, or raise "
             "most_steps"
         )
     return Budget(int(min(most_steps, COUNTABLE)))
@@ -403,18 +483,24 @@ def _in_natural_units(pendulum: Pendulum, max_period: float) -> tuple[Pendulum, 
     return jax.tree.map(float, natural(pendulum)), 0.5 * max_period / second * (1 + BEYOND), second
 
 
-def returns(pendulum: Pendulum, theta1: float, max_period: float, intervals: int, budget: Budget) -> Scan:
+def returns(
+    pendulum: Pendulum, theta1: float, max_period: float, intervals: int, budget: Budget
+) -> Scan:
     """All returns to rest within half of `max_period`, times in seconds."""
     scaled, half, second = _in_natural_units(pendulum, max_period)
     result = scanned(scaled, math.remainder(theta1, 2 * math.pi), half, intervals, budget)
-    zeros = tuple(zero._replace(time=zero.time * second, row=zero.row * second) for zero in result.zeros)
+    zeros = tuple(
+        zero._replace(time=zero.time * second, row=zero.row * second) for zero in result.zeros
+    )
     return replace(result, zeros=zeros)
 
 
 def _solved(
     pendulum: Pendulum, theta1: float, max_period: float, result: Scan, budget: Budget
 ) -> tuple[list[PeriodicOrbit], int]:
-    """The orbits to which the returns belong, in order of the period, and the number that Newton's method lost."""
+    """The orbits to which the returns belong, in order of the period, and the number that Newton's
+    method lost.
+    """
     found: list[PeriodicOrbit] = []
     known = np.zeros((0, 2))
     lost = 0
@@ -459,4 +545,6 @@ def are_returns(places: np.ndarray, zero: Zero) -> np.ndarray:
 
 
 def _row(orbit: PeriodicOrbit) -> dict[str, np.ndarray]:
-    return table_of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], orbit), "", np.full(1, np.nan))
+    return table_of(
+        jax.tree.map(lambda leaf: np.asarray(leaf)[None], orbit), "", np.full(1, np.nan)
+    )

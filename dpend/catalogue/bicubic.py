@@ -1,4 +1,6 @@
-"""Cells of a rectangle with their bicubics: which are empty, which hold one zero, which are to be halved."""
+"""Cells of a rectangle with their bicubics: which are empty, which hold one zero, which are to be
+halved.
+"""
 
 from typing import Any, NamedTuple
 
@@ -6,14 +8,17 @@ import numpy as np
 
 # The error counts that far about a row, nearly a radian of the fast mode.
 _NEARBY = 16
-# A cell that is bent in time more than in theta2, as near a fold, is halved in time, so often at most.
+# A cell that is bent in time more than in theta2, as near a fold, is halved in time, so often at
+# most.
 SPLITS = 12
 # How far from the unit matrix a derivative may be.
 _DOMINANCE = 0.9
 
 
 class Intervals(NamedTuple):
-    """Intervals of theta2 and G at their ends: value, slopes in time and theta2, and mixed, shape (4, 2, rows, n)."""
+    """Intervals of theta2 and G at their ends: value, slopes in time and theta2, and mixed, shape
+    (4, 2, rows, n).
+    """
 
     left: np.ndarray
     right: np.ndarray
@@ -21,7 +26,9 @@ class Intervals(NamedTuple):
     at_right: np.ndarray
 
     def some(self, which: Any) -> "Intervals":
-        return Intervals(self.left[which], self.right[which], self.at_left[..., which], self.at_right[..., which])
+        return Intervals(
+            self.left[which], self.right[which], self.at_left[..., which], self.at_right[..., which]
+        )
 
 
 class Half(NamedTuple):
@@ -30,7 +37,9 @@ class Half(NamedTuple):
 
 
 def largest_nearby(error: np.ndarray) -> np.ndarray:
-    """The largest error at any row near each cell: one that is small in a few rows alone is so by accident."""
+    """The largest error at any row near each cell: one that is small in a few rows alone is so by
+    accident.
+    """
     far = 1
     while far < _NEARBY:
         padded = np.pad(error, ((far, far), (0, 0)), mode="edge")
@@ -69,15 +78,23 @@ class Cells(NamedTuple):
     start: np.ndarray
 
     def told(self) -> "_Told":
-        by_angle, by_time = 3 * (self.net[1:] - self.net[:-1]), 3 * (self.net[:, 1:] - self.net[:, :-1])
+        by_angle, by_time = (
+            3 * (self.net[1:] - self.net[:-1]),
+            3 * (self.net[:, 1:] - self.net[:, :-1]),
+        )
         across, along = by_angle.mean(axis=(0, 1)), by_time.mean(axis=(0, 1))
         determinant = across[0] * along[1] - across[1] * along[0]
         inverse = np.array([[along[1], -along[0]], [-across[1], across[0]]]) / determinant
         error = np.abs(inverse).sum(axis=1) * self.error
         value = _product(inverse, self.net)
-        below, above = np.max(value, axis=(0, 1)) + error < 0, np.min(value, axis=(0, 1)) - error > 0
+        below, above = (
+            np.max(value, axis=(0, 1)) + error < 0,
+            np.min(value, axis=(0, 1)) - error > 0,
+        )
         (left,) = np.nonzero(~np.any(below | above, axis=0))
-        by_angle, by_time = (_product(inverse[..., left], net[..., left]) for net in (by_angle, by_time))
+        by_angle, by_time = (
+            _product(inverse[..., left], net[..., left]) for net in (by_angle, by_time)
+        )
 
         def worst(net: np.ndarray) -> np.ndarray:
             return np.max(np.abs(net), axis=(0, 1))
@@ -89,7 +106,9 @@ class Cells(NamedTuple):
         # A cubic's slope is wrong by up to four times its value's error, at either end.
         near = apart + 8 * np.max(error[:, left], axis=0) < _DOMINANCE
         simple = left[near]
-        return _Told(left[~near], simple, _zero_of(value[..., simple]), np.sign(determinant[simple]))
+        return _Told(
+            left[~near], simple, _zero_of(value[..., simple]), np.sign(determinant[simple])
+        )
 
     def bent_in_time(self, which: np.ndarray) -> np.ndarray:
         """Whether parts are further from linear in time than in theta2."""
@@ -99,7 +118,9 @@ class Cells(NamedTuple):
         return np.asarray(along > across)
 
     def halved(self, which: np.ndarray, split: int) -> "Cells":
-        """Both halves in time, by de Casteljau's construction, of parts halved `split` times before."""
+        """Both halves in time, by de Casteljau's construction, of parts halved `split` times
+        before.
+        """
         a, b, c, d = np.moveaxis(self.net[..., which], 1, 0)
         ab, bc, cd = (a + b) / 2, (b + c) / 2, (c + d) / 2
         abc, bcd = (ab + bc) / 2, (bc + cd) / 2
@@ -115,8 +136,8 @@ class Cells(NamedTuple):
 
 
 class _Told(NamedTuple):
-    """Which parts are open, being neither empty nor simple, and which simple; where these have their zero, in units of
-    their sides, and its sign.
+    """Which parts are open, being neither empty nor simple, and which simple; where these have
+    their zero, in units of their sides, and its sign.
     """
 
     open: np.ndarray
@@ -131,7 +152,9 @@ def _product(matrix: np.ndarray, net: np.ndarray) -> np.ndarray:
 
 
 def _zero_of(net: np.ndarray) -> np.ndarray:
-    """Newton's method for the zero of bicubics that are near the identity plus a shift, shape (2, cells)."""
+    """Newton's method for the zero of bicubics that are near the identity plus a shift, shape (2,
+    cells).
+    """
     x = np.full((2, net.shape[-1]), 0.5)
     for _ in range(_NEWTON):
         (a, slope_a), (b, slope_b) = (_bernstein(each) for each in x)
@@ -156,7 +179,9 @@ def _bernstein(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turn_along(some: Intervals) -> float:
-    """How far p at the last time turns clockwise about zero over these intervals, along their cubics."""
+    """How far p at the last time turns clockwise about zero over these intervals, along their
+    cubics.
+    """
     start, end = some.at_left[:, :, -1], some.at_right[:, :, -1]
     width = (some.right - some.left) / 3
     net = np.stack([start[0], start[0] + width * start[2], end[0] - width * end[2], end[0]])

@@ -1,8 +1,9 @@
 """The file of an atlas: its columns and units, and what every row of a true one satisfies.
 
-A table that was damaged on its way is refused, with the row and the column. The columns depend on each other, and that
-tells most damages: the energy is that of either rest, `log_abs_kappa` is the logarithm of kappa, the dual of a centred
-orbit follows from its release, and neighbours on a family lie no further apart than arclength allows.
+A table that was damaged on its way is refused, with the row and the column. The columns depend on
+each other, and that tells most damages: the energy is that of either rest, `log_abs_kappa` is the
+logarithm of kappa, the dual of a centred orbit follows from its release, and neighbours on a family
+lie no further apart than arclength allows.
 """
 
 import csv
@@ -22,8 +23,9 @@ from dpend.orbits.orbit import RELEASED_SYMMETRIES
 from dpend.records import parse_json, read_text
 from dpend.status import Status
 
-# Energies are compared in units of the weights' torques. That of the release is rounding away (4e-16 in the published
-# catalogue). The dual is the end of an integration, whose error grows like the root of kappa: 4e-13 in the catalogue.
+# Energies are compared in units of the weights' torques. That of the release is rounding away
+# (4e-16 in the published catalogue). The dual is the end of an integration, whose error grows like
+# the root of kappa: 4e-13 in the catalogue.
 _ENERGY, _ENERGY_OF_DUAL, _GROWTH = 1e-12, 1e-9, 1e-13
 # What a degree loses on its way to radians and back, relative to the angle.
 _DEGREES = 1e-15
@@ -31,18 +33,20 @@ _DEGREES = 1e-15
 _HALF_TURNS = 1e-9
 # kappa against its logarithm, and below -1: both are rounding, and zero in the catalogue.
 _KAPPA = 1e-8
-# Where kappa is above the first it is held to the largest that float64 can square, and its logarithm is above the
-# second.
+# Where kappa is above the first it is held to the largest that float64 can square, and its
+# logarithm is above the second.
 _CAPPED, _ITS_LOGARITHM = 1e290, 600.0
 # Newton's methods stop at this residual at the latest; it grows like the root of kappa.
 _RESIDUAL = 1e-6
 # The longest period itself lies inside, to this share.
 _LONGEST = 1e-11
-# Along a family either rest moves no faster than the root of the number of nodes, whose mean square is
-# arclength (2.1 in the catalogue), and log of the period not much faster than arclength (0.9 there).
+# Along a family either rest moves no faster than the root of the number of nodes, whose mean square
+# is arclength (2.1 in the catalogue), and log of the period not much faster than arclength (0.9
+# there).
 # Arclength itself is rounded.
 _REST, _LOG_PERIOD, _ARCLENGTH = math.sqrt(SEGMENTS), 3.0, 1e-9
-# Periods between two rows may be shorter than both, and the limit of shrinking orbits is extrapolated [relative].
+# Periods between two rows may be shorter than both, and the limit of shrinking orbits is
+# extrapolated [relative].
 _SHORTEST = 1e-3
 
 Table: TypeAlias = dict[str, np.ndarray]
@@ -119,8 +123,18 @@ _SPECIAL = {
     "period_s": float,
     "kappa": float,
 }
-_ENDS = ("normal mode", "homoclinic", "closed", "branch point", "longest period", "lost", "unfinished")
-_KIND = re.compile(r"stability_lost|stability_gained|fold_theta1|fold_energy|crossing|resonance_[1-9]\d*:[1-9]\d*")
+_ENDS = (
+    "normal mode",
+    "homoclinic",
+    "closed",
+    "branch point",
+    "longest period",
+    "lost",
+    "unfinished",
+)
+_KIND = re.compile(
+    r"stability_lost|stability_gained|fold_theta1|fold_energy|crossing|resonance_[1-9]\d*:[1-9]\d*"
+)
 _NUMBER = re.compile(r"-?(\d+(\.\d*)?([eE][-+]?\d+)?|inf)|nan", re.ASCII)
 _INTEGER = re.compile(r"-?\d{1,18}", re.ASCII)
 _TYPES = {
@@ -171,7 +185,8 @@ def pendulum_record(pendulum: Pendulum) -> dict[str, float]:
 def read_catalogue(path: Path) -> Catalogue:
     """What F.csv or F.json holds; rows are counted from 1, and lines too.
 
-    Files of any `dpend_version` are read: what they must be like is said here, and a number is as true as before.
+    Files of any `dpend_version` are read: what they must be like is said here, and a number is as
+    true as before.
 
     Raises:
         OSError: it cannot be read.
@@ -205,7 +220,9 @@ def _csv_parts(text: str) -> tuple[Any, _Rows]:
     _check_names("the header", header, [file_name(key) for key in COLUMNS])
     for i, (row, line) in enumerate(found[1:]):
         if len(row) != len(header):
-            raise ValueError(f"row {i + 1} in line {line} has {len(row)} cells, the header has {len(header)}")
+            raise ValueError(
+                f"row {i + 1} in line {line} has {len(row)} cells, the header has {len(header)}"
+            )
     columns = list(zip(*(row for row, _ in found[1:]), strict=True)) or [()] * len(header)
     by_name = dict(zip(header, columns, strict=True))
 
@@ -224,7 +241,9 @@ def _parse_cells(column: str, cells: Sequence[str], place: Callable[[int], str])
     pattern = _NUMBER if kind is float else _INTEGER
     for i, cell in enumerate(cells):
         if not pattern.fullmatch(cell):
-            raise ValueError(f"{place(i)}: {file_name(column)} must be {_TYPES[kind]}, is {cell!r:.60}")
+            raise ValueError(
+                f"{place(i)}: {file_name(column)} must be {_TYPES[kind]}, is {cell!r:.60}"
+            )
     return [kind(cell) for cell in cells]
 
 
@@ -246,7 +265,9 @@ def _json_parts(text: str) -> tuple[Any, _Rows]:
             raise ValueError(f"row {i + 1}: turns must be a list of two integers, is {turns!r:.60}")
         row |= {f"dual_{key}": value for key, value in dual.items()}
         row |= {"turns1": turns[0], "turns2": turns[1]}
-    return about, _Rows({key: [row[file_name(key)] for row in rows] for key in COLUMNS}, lambda i: f"row {i + 1}")
+    return about, _Rows(
+        {key: [row[file_name(key)] for row in rows] for key in COLUMNS}, lambda i: f"row {i + 1}"
+    )
 
 
 def _column(column: str, rows: _Rows) -> np.ndarray:
@@ -256,7 +277,9 @@ def _column(column: str, rows: _Rows) -> np.ndarray:
         known = {status.name.lower(): int(status) for status in Status}
         for i, cell in enumerate(cells):
             if type(cell) is not str or cell not in known:
-                raise ValueError(f"{rows.place(i)}: status must be one of {', '.join(known)}, is {cell!r:.60}")
+                raise ValueError(
+                    f"{rows.place(i)}: status must be one of {', '.join(known)}, is {cell!r:.60}"
+                )
         return np.array([known[cell] for cell in cells], int)
     if kind is float:
         for i, cell in enumerate(cells):
@@ -270,7 +293,11 @@ def _column(column: str, rows: _Rows) -> np.ndarray:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and abs(value) <= sys.float_info.max
+    )
 
 
 def check_type(place: str, value: Any, kind: type) -> None:
@@ -329,7 +356,9 @@ def _check_about(about: Any) -> tuple[Pendulum, float]:
 
 def check_least(place: str, value: float | int, least: float | int, strict: bool = False) -> None:
     if value < least or (strict and value == least):
-        raise ValueError(f"{place} must be {'above' if strict else 'at least'} {least:g}, is {value:.10g}")
+        raise ValueError(
+            f"{place} must be {'above' if strict else 'at least'} {least:g}, is {value:.10g}"
+        )
 
 
 def _check_one_of(place: str, value: Any, known: Sequence[str]) -> None:
@@ -341,18 +370,28 @@ def _check_family(place: str, family: Any, max_period: float | int) -> None:
     """Refuses the record of a family that has another form, or special points beyond it."""
     check_record(place, family, _FAMILY)
     _check_one_of(f"{place}.symmetry", family["symmetry"], RELEASED_SYMMETRIES)
-    if not re.fullmatch(family["symmetry"][0].upper() + r"[1-9]\d{0,8}", family["family"], re.ASCII):
-        raise ValueError(f"{place}.family must be a {family['symmetry']} one's name, is {family['family']!r:.60}")
+    if not re.fullmatch(
+        family["symmetry"][0].upper() + r"[1-9]\d{0,8}", family["family"], re.ASCII
+    ):
+        raise ValueError(
+            f"{place}.family must be a {family['symmetry']} one's name, is {family['family']!r:.60}"
+        )
     _check_one_of(f"{place}.status", family["status"], [status.name.lower() for status in Status])
     if len(family["ends"]) != 2:
         raise ValueError(f"{place}.ends must be a list of two, is {family['ends']!r:.60}")
     for i, end in enumerate(family["ends"]):
         _check_one_of(f"{place}.ends[{i}]", end, _ENDS)
-    shortest, longest, most = family["shortest_period_s"], family["longest_period_s"], max_period * (1 + _LONGEST)
+    shortest, longest, most = (
+        family["shortest_period_s"],
+        family["longest_period_s"],
+        max_period * (1 + _LONGEST),
+    )
     check_least(f"{place}.shortest_period_s", shortest, 0, strict=True)
     check_least(f"{place}.longest_period_s", longest, shortest * (1 - _SHORTEST))
     if longest > most:
-        raise ValueError(f"{place}.longest_period_s is {longest:.10g}, max_period_s is {max_period:.10g}")
+        raise ValueError(
+            f"{place}.longest_period_s is {longest:.10g}, max_period_s is {max_period:.10g}"
+        )
     last = 0.0
     for i, point in enumerate(family["special_points"]):
         where = f"{place}.special_points[{i}]"
@@ -362,7 +401,9 @@ def _check_family(place: str, family: Any, max_period: float | int) -> None:
         check_least(f"{where}.arclength", point["arclength"], last)
         check_least(f"{where}.period_s", point["period_s"], shortest * (1 - _SHORTEST))
         if point["period_s"] > most:
-            raise ValueError(f"{where}.period_s is {point['period_s']:.10g}, max_period_s is {max_period:.10g}")
+            raise ValueError(
+                f"{where}.period_s is {point['period_s']:.10g}, max_period_s is {max_period:.10g}"
+            )
         last = point["arclength"]
 
 
@@ -372,7 +413,9 @@ class _Check(NamedTuple):
     table: Table
     place: Callable[[int], str]
 
-    def refuse(self, wrong: np.ndarray, column: str, says: str, other: np.ndarray | None = None) -> None:
+    def refuse(
+        self, wrong: np.ndarray, column: str, says: str, other: np.ndarray | None = None
+    ) -> None:
         """Refuses the first wrong row, with what its column is and what speaks against it."""
         if not np.any(wrong):
             return
@@ -386,7 +429,9 @@ class _Check(NamedTuple):
         raise ValueError(f"{self.place(i)}: {file_name(column)} is {shown}, {against}")
 
     def run(self, pendulum: Pendulum, max_period: float, families: Families) -> None:
-        """Refuses the first row that no orbit has: where a solve failed, numbers may be missing and need not agree."""
+        """Refuses the first row that no orbit has: where a solve failed, numbers may be missing and
+        need not agree.
+        """
         table = self.table
         for column, kind in COLUMNS.items():
             if kind is float and column not in ("arclength", "log_abs_kappa"):
@@ -412,8 +457,14 @@ class _Check(NamedTuple):
     def check_words(self, families: Families) -> None:
         """Symmetries and families are known ones, and belong together."""
         table = self.table
-        self.refuse(~np.isin(table["symmetry"], RELEASED_SYMMETRIES), "symmetry", "and must be centred or brake")
-        known = f"the families are {', '.join(families)}" if families else "and there are no families"
+        self.refuse(
+            ~np.isin(table["symmetry"], RELEASED_SYMMETRIES),
+            "symmetry",
+            "and must be centred or brake",
+        )
+        known = (
+            f"the families are {', '.join(families)}" if families else "and there are no families"
+        )
         self.refuse(~np.isin(table["family"], list(families) or [""]), "family", known)
         for name, family in families.items():
             wrong = (table["family"] == name) & (table["symmetry"] != family["symmetry"])
@@ -424,7 +475,9 @@ class _Check(NamedTuple):
         table, sound = self.table, self.sound
         self.refuse(sound & ~(table["period"] > 0), "period", "and must be positive")
         most = max_period * (1 + _LONGEST)
-        self.refuse(sound & ~(table["period"] <= most), "period", f"max_period_s is {max_period:.10g}")
+        self.refuse(
+            sound & ~(table["period"] <= most), "period", f"max_period_s is {max_period:.10g}"
+        )
         for column in ("residual", "theta2_error", "period_error", "iterations"):
             self.refuse(table[column] < 0, column, "and must not be negative")
         most_left = _RESIDUAL + _GROWTH * np.sqrt(np.abs(table["kappa"]))
@@ -448,8 +501,12 @@ class _Check(NamedTuple):
         """kappa and its logarithm, which is that of kappa - 1 where much has cancelled."""
         kappa, logarithm = self.table["kappa"], self.table["log_abs_kappa"]
         size = np.abs(kappa)
-        near = np.minimum(np.abs(np.exp(logarithm) - size), np.abs(np.exp(logarithm) - np.abs(kappa - 1)))
-        agree = (near <= _KAPPA * (1 + size)) | ((size > 1) & (np.abs(logarithm - np.log(size)) <= _KAPPA))
+        near = np.minimum(
+            np.abs(np.exp(logarithm) - size), np.abs(np.exp(logarithm) - np.abs(kappa - 1))
+        )
+        agree = (near <= _KAPPA * (1 + size)) | (
+            (size > 1) & (np.abs(logarithm - np.log(size)) <= _KAPPA)
+        )
         agree |= (size > _CAPPED) & (logarithm > _ITS_LOGARITHM)
         self.refuse(self.sound & ~agree, "log_abs_kappa", "kappa is", kappa)
 
@@ -457,13 +514,25 @@ class _Check(NamedTuple):
         """A centred orbit is its own image, and never doubles its period; others have no turns."""
         table = self.table
         centred = self.sound & (table["symmetry"] == "centred")
-        self.refuse(centred & ~(table["kappa"] >= -1 - _KAPPA), "kappa", "below -1 on a centred orbit")
+        self.refuse(
+            centred & ~(table["kappa"] >= -1 - _KAPPA), "kappa", "below -1 on a centred orbit"
+        )
         for rod in "12":
-            release, dual, turns = (table[f"{name}{rod}"] for name in ("theta", "dual_theta", "turns"))
+            release, dual, turns = (
+                table[f"{name}{rod}"] for name in ("theta", "dual_theta", "turns")
+            )
             image = 2 * np.pi * turns - release
-            wrong = centred & ~(np.abs(dual - image) <= _HALF_TURNS + _DEGREES * (np.abs(dual) + np.abs(release)))
-            self.refuse(wrong, f"dual_theta{rod}", f"turns{rod} and its release say", np.degrees(image))
-            self.refuse((table["symmetry"] == "brake") & (turns != 0), f"turns{rod}", "of an orbit that is not centred")
+            wrong = centred & ~(
+                np.abs(dual - image) <= _HALF_TURNS + _DEGREES * (np.abs(dual) + np.abs(release))
+            )
+            self.refuse(
+                wrong, f"dual_theta{rod}", f"turns{rod} and its release say", np.degrees(image)
+            )
+            self.refuse(
+                (table["symmetry"] == "brake") & (turns != 0),
+                f"turns{rod}",
+                "of an orbit that is not centred",
+            )
 
     def check_releases(self) -> None:
         """Those of one angle are each there once, and have no arclength."""
@@ -486,11 +555,15 @@ class _Check(NamedTuple):
             self.refuse(high, "period", f"the longest of its family is {longest:.10g}")
             self.refuse_neighbours(np.flatnonzero(own), "arclength", lambda way, step: way <= 0)
             rows = np.flatnonzero(own & self.sound)
-            self.refuse_neighbours(rows, "log_period", lambda way, step: np.abs(way) > _LOG_PERIOD * step)
+            self.refuse_neighbours(
+                rows, "log_period", lambda way, step: np.abs(way) > _LOG_PERIOD * step
+            )
             for column in ("theta1", "theta2", "dual_theta1", "dual_theta2"):
                 self.refuse_neighbours(rows, column, lambda way, step: np.abs(way) > _REST * step)
 
-    def refuse_neighbours(self, rows: np.ndarray, column: str, leaps: Callable[..., np.ndarray]) -> None:
+    def refuse_neighbours(
+        self, rows: np.ndarray, column: str, leaps: Callable[..., np.ndarray]
+    ) -> None:
         """Refuses a row too far from the one before, on its family."""
         values = np.log(self.table["period"]) if column == "log_period" else self.table[column]
         step = np.diff(self.table["arclength"][rows]) + _ARCLENGTH

@@ -1,10 +1,11 @@
 """The whole square: every family of brake orbits up to a period.
 
-Slices theta1 = const are scanned for all returns to rest (see `scan`), and what belongs to no known family starts a new
-one, followed both ways by continuation. Each return is held against the families' curves in (theta1, theta2, period),
-and each passage of a family through a slice against the returns: neither side may have more than the other. Slices are
-doubled until two doublings have shown no new family: one that was missed turns back twice between neighbouring slices,
-with both its rests.
+Slices theta1 = const are scanned for all returns to rest (see `scan`), and what belongs to no known
+family starts a new one, followed both ways by continuation. Each return is held against the
+families' curves in (theta1, theta2, period), and each passage of a family through a slice against
+the returns: neither side may have more than the other. Slices are doubled until two doublings have
+shown no new family: one that was missed turns back twice between neighbouring slices, with both its
+rests.
 """
 
 import hashlib
@@ -45,15 +46,17 @@ from dpend.orbits.orbit import PeriodicOrbit
 from dpend.records import json_text, parse_json, read_text, replacing
 from dpend.status import Status
 
-# Doublings of the slices: this many to begin with, and at most so many. Slices are odd multiples of pi/2^(level + 1).
+# Doublings of the slices: this many to begin with, and at most so many. Slices are odd multiples of
+# pi/2^(level + 1).
 _FIRST_LEVELS, _MOST_LEVELS, _LEVELS_WITHOUT_NEWS = 5, 10, 2
 # Intervals of theta2 that a slice's scan begins with; more where it leaves a doubt.
 _INTERVALS, _MORE_INTERVALS = 128, 1024
 
-# Families have about so many points, slices are about so many, and there are so many families to a wave of p: 13
-# for 5.7 waves of the paper's pendulum at 2 s.
+# Families have about so many points, slices are about so many, and there are so many families to a
+# wave of p: 13 for 5.7 waves of the paper's pendulum at 2 s.
 _USUAL_POINTS, _USUAL_SLICES, _FAMILIES_PER_WAVE = 150, 127, 2
-# Points on one side of where a family was met: the longest of the published catalogue has 188 in all.
+# Points on one side of where a family was met: the longest of the published catalogue has 188 in
+# all.
 _MOST_POINTS = 2000
 
 
@@ -65,29 +68,35 @@ def find_brake_families(
     most_steps: Any = MOST_SEARCH_STEPS,
     progress: Callable[[int, int, int], None] | Any | None = None,
 ) -> Atlas:
-    """Every family of orbits released from rest with a period of at most `max_period`, on the whole square of angles.
+    """Every family of orbits released from rest with a period of at most `max_period`, on the whole
+    square of angles.
 
-    An orbit and its dual, and their mirror images, are one entry: a family is one curve of releases, and its dual
-    curve, their images under theta -> -theta, and runs through an orbit several times are the same family.
+    An orbit and its dual, and their mirror images, are one entry: a family is one curve of
+    releases, and its dual curve, their images under theta -> -theta, and runs through an orbit
+    several times are the same family.
 
     Arguments:
         pendulum: its fields are numbers; g positive.
         max_period: [s]. The number of families, and the time it takes, grows exponentially with it.
         store: F.json, written after every slice; a search that was stopped goes on from there.
-        most_steps: time steps of all motions, 2 to 8 microseconds each on one core. A search that will take more is
-            refused before it begins; one that takes more after all ends there, its coverage says `exhausted`, and with
-            a store it can be taken up again.
-        progress: called with slices done, slices planned so far, and families found, after every slice and family.
+        most_steps: time steps of all motions, 2 to 8 microseconds each on one core. A search that
+            will take more is refused before it begins; one that takes more after all ends there,
+            its coverage says `exhausted`, and with a store it can be taken up again.
+        progress: called with slices done, slices planned so far, and families found, after every
+            slice and family.
     Returns:
-        Atlas, family by family, in order of arclength from the end with the shorter period. Families are called C1, C2
-        (centred) and B1, B2 (brake) in order of their shortest period, so that a name does not depend on how a family
-        was found, nor on `max_period`. Their records: `family`, `symmetry`, `ends` as in `Family` (`longest period`
-        where it goes on beyond max_period), `shortest_period_s` on it (the limit where it shrinks onto a normal mode)
-        and `longest_period_s`, `special_points` with kind, arclength, release in degrees, period and kappa.
+        Atlas, family by family, in order of arclength from the end with the shorter period.
+        Families are called C1, C2 (centred) and B1, B2 (brake) in order of their shortest period,
+        so that a name does not depend on how a family was found, nor on `max_period`. Their
+        records: `family`, `symmetry`, `ends` as in `Family` (`longest period` where it goes on
+        beyond max_period), `shortest_period_s` on it (the limit where it shrinks onto a normal
+        mode) and `longest_period_s`, `special_points` with kind, arclength, release in degrees,
+        period and kappa.
     Raises:
-        ValueError: max_period not positive, or so long that the fast normal mode would swing 32 times; g not positive;
-            a traced argument; most_steps not enough; lengths, masses or g whose products leave the range of float64; a
-            store made with other settings, damaged, or no file.
+        ValueError: max_period not positive, or so long that the fast normal mode would swing 32
+            times; g not positive; a traced argument; most_steps not enough; lengths, masses or g
+            whose products leave the range of float64; a store made with other settings, damaged, or
+            no file.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -107,7 +116,9 @@ def find_brake_families(
     for level in range(_MOST_LEVELS):
         planned = 2 ** (max(level + 1, _FIRST_LEVELS)) - 1
         if progress is not None:
-            budget.tell = lambda _, planned=planned: progress(len(survey.slices), planned, len(survey.tracks))
+            budget.tell = lambda _, planned=planned: progress(
+                len(survey.slices), planned, len(survey.tracks)
+            )
             budget.spend(0)
         for angle in _angles(level):
             if angle not in survey.slices and not budget.exhausted:
@@ -123,8 +134,14 @@ def find_brake_families(
 
 
 def expected_steps(pendulum: Pendulum, max_period: float) -> int:
-    """The time steps that `find_brake_families` will take, roughly, from what three slices have before them."""
-    seen = [foresee_returns(pendulum, angle, max_period) for level in range(2) for angle in _angles(level)]
+    """The time steps that `find_brake_families` will take, roughly, from what three slices have
+    before them.
+    """
+    seen = [
+        foresee_returns(pendulum, angle, max_period)
+        for level in range(2)
+        for angle in _angles(level)
+    ]
     waves = sum(one.waves for one in seen) / len(seen)
     motions = 2 * _INTERVALS + MOTIONS_PER_WAVE * waves
     slices = _USUAL_SLICES * motions * seen[0].rows
@@ -166,7 +183,9 @@ class _Survey:
     budget: Budget = field(default_factory=lambda: Budget(MOST_SEARCH_STEPS))
 
     def look_at(self, theta1: float, level: int) -> None:
-        """Scans a slice, and follows what belongs to no family yet; a slice that the budget cuts short is none."""
+        """Scans a slice, and follows what belongs to no family yet; a slice that the budget cuts
+        short is none.
+        """
         result = returns(self.pendulum, theta1, self.max_period, _INTERVALS, self.budget)
         if result.open_cells or result.degree != result.winding:
             result = returns(self.pendulum, theta1, self.max_period, _MORE_INTERVALS, self.budget)
@@ -178,7 +197,9 @@ class _Survey:
         for zero in zeros:
             if self.budget.exhausted:
                 return
-            if 2 * zero.time <= self.max_period and not self._known(theta1, zero.theta2, 2 * zero.time):
+            if 2 * zero.time <= self.max_period and not self._known(
+                theta1, zero.theta2, 2 * zero.time
+            ):
                 found.lost += not self._follow(theta1, zero, level)
         if not self.budget.exhausted:
             self.slices[theta1] = found
@@ -205,7 +226,8 @@ class _Survey:
         for i, track in enumerate(self.tracks):
             self.budget.spend(len(new.family.arclength) * track.price)
             if track.is_same(new):
-                # Met where its chords were not near enough; the one that was followed further stays.
+                # Met where its chords were not near enough; the one that was followed further
+                # stays.
                 if len(new.chords) > len(track.chords):
                     self.tracks[i] = replace(new, level=track.level)
                 return True
@@ -215,14 +237,19 @@ class _Survey:
     def track(self, orbit: PeriodicOrbit, seed: tuple[float, float, float], level: int) -> Track:
         longest = max(self.max_period, float(orbit.period))
         family = follow_family(
-            self.pendulum, orbit, longest_step=STEP, longest_period=longest, most_points=_MOST_POINTS
+            self.pendulum,
+            orbit,
+            longest_step=STEP,
+            longest_period=longest,
+            most_points=_MOST_POINTS,
         )
         return Track.of(family, seed, level)
 
     def unmatched(self) -> list[tuple[float, float, float]]:
-        """What is left when each slice's returns are given to the families' passages, one to one: the returns and the
-        passages (theta1, theta2, period) that have no partner. Where a family turns back in a slice, its chords may
-        have two passages more or less than the curve: pairs close together are let go.
+        """What is left when each slice's returns are given to the families' passages, one to one:
+        the returns and the passages (theta1, theta2, period) that have no partner. Where a family
+        turns back in a slice, its chords may have two passages more or less than the curve: pairs
+        close together are let go.
         """
         return [
             (theta1, *one)
@@ -232,7 +259,9 @@ class _Survey:
         ]
 
     def _passages(self, theta1: float) -> np.ndarray:
-        """(theta2, period) where families pass a slice, run through as often as the longest period allows."""
+        """(theta2, period) where families pass a slice, run through as often as the longest period
+        allows.
+        """
         points = [np.zeros((0, 2))]
         for track in self.tracks:
             passages = track.passages(theta1)
@@ -268,8 +297,8 @@ class _Survey:
         return Atlas(self.pendulum, self.max_period, stacked(tables), tuple(records), coverage)
 
 
-# Families with shortest periods this near to each other, relative, as the oscillations about both saddles of equal rods
-# and masses have, go by their energies there.
+# Families with shortest periods this near to each other, relative, as the oscillations about both
+# saddles of equal rods and masses have, go by their energies there.
 _TIE = 1e-6
 
 _Entry: TypeAlias = tuple[dict[str, np.ndarray], dict[str, Any]]
@@ -291,8 +320,9 @@ def _in_order(entries: list[_Entry]) -> list[_Entry]:
 
 
 def _shortest(table: dict[str, np.ndarray], ends: Sequence[str]) -> float:
-    """The shortest period on a family, whatever its points: a parabola's between points, and where it shrinks onto a
-    normal mode the limit, from which the period parts with the square of the swing.
+    """The shortest period on a family, whatever its points: a parabola's between points, and where
+    it shrinks onto a normal mode the limit, from which the period parts with the square of the
+    swing.
     """
     period, where = table["period"], table["arclength"]
     i, last = int(np.argmin(period)), len(period) - 1
@@ -308,17 +338,25 @@ def _shortest(table: dict[str, np.ndarray], ends: Sequence[str]) -> float:
 
 
 def _entry(family: Family, max_period: float) -> _Entry:
-    """The rows of a family within the longest period, and its record; turned and mirrored into a standard form."""
+    """The rows of a family within the longest period, and its record; turned and mirrored into a
+    standard form.
+    """
     orbits = jax.tree.map(np.asarray, family.orbits)
     period = np.asarray(orbits.period)
     back = period[0] > period[-1]
     order = slice(None, None, -1) if back else slice(None)
     arclength = np.asarray(family.arclength)
     start = arclength[-1] if back else arclength[0]
-    table = {key: column[order] for key, column in table_of(orbits, "", np.abs(arclength - start)).items()}
+    table = {
+        key: column[order]
+        for key, column in table_of(orbits, "", np.abs(arclength - start)).items()
+    }
     least = int(np.argmin(table["period"]))
     sign = -1 if math.remainder(table["theta1"][least], 2 * math.pi) < 0 else 1
-    turns = np.round(sign * table["theta1"][least] / (2 * np.pi)), np.round(sign * table["theta2"][least] / (2 * np.pi))
+    turns = (
+        np.round(sign * table["theta1"][least] / (2 * np.pi)),
+        np.round(sign * table["theta2"][least] / (2 * np.pi)),
+    )
     for rod, shift in zip(("1", "2"), turns, strict=True):
         for key in (f"theta{rod}", f"dual_theta{rod}"):
             table[key] = sign * table[key] - 2 * np.pi * shift
@@ -337,8 +375,12 @@ def _entry(family: Family, max_period: float) -> _Entry:
             {
                 "kind": _seen_from_the_other_end(point.kind) if back else point.kind,
                 "arclength": abs(float(point.arclength - start)),
-                "theta1_deg": math.degrees(sign * float(point.orbit.theta1) - 2 * math.pi * turns[0]),
-                "theta2_deg": math.degrees(sign * float(point.orbit.theta2) - 2 * math.pi * turns[1]),
+                "theta1_deg": math.degrees(
+                    sign * float(point.orbit.theta1) - 2 * math.pi * turns[0]
+                ),
+                "theta2_deg": math.degrees(
+                    sign * float(point.orbit.theta2) - 2 * math.pi * turns[1]
+                ),
                 "period_s": float(point.orbit.period),
                 "kappa": float(point.orbit.kappa),
             }
@@ -350,7 +392,9 @@ def _entry(family: Family, max_period: float) -> _Entry:
 
 
 def _seen_from_the_other_end(kind: str) -> str:
-    return {"stability_lost": "stability_gained", "stability_gained": "stability_lost"}.get(kind, kind)
+    return {"stability_lost": "stability_gained", "stability_gained": "stability_lost"}.get(
+        kind, kind
+    )
 
 
 # What a store says, and of what types.
@@ -379,7 +423,9 @@ def _settings(survey: _Survey) -> dict[str, Any]:
 
 
 def _checksum(record: dict[str, Any]) -> str:
-    """Of all else in a store: a search that went on from other numbers would be wrong and not show it."""
+    """Of all else in a store: a search that went on from other numbers would be wrong and not show
+    it.
+    """
     rest = {key: value for key, value in record.items() if key != "checksum"}
     return hashlib.sha256(json_text(rest, indent=None).encode()).hexdigest()
 
@@ -405,7 +451,8 @@ def _read_store(survey: _Survey, path: Path) -> dict[str, Any]:
     if kept != settings:
         wrong = next(key for key in (*settings, *kept) if kept.get(key) != settings.get(key))
         raise ValueError(
-            f"store must have been made with the same settings, got {path} with {wrong} {kept.get(wrong)!r:.200}: "
+            f"store must have been made with the same settings, got {path} with {wrong} "
+            f"{kept.get(wrong)!r:.200}: "
             "give another name"
         )
     try:
@@ -416,11 +463,16 @@ def _read_store(survey: _Survey, path: Path) -> dict[str, Any]:
 
 
 def _no_store(path: Path, reason: str) -> ValueError:
-    return ValueError(f"store must be a file that find_brake_families wrote, got {path} ({reason}): give another name")
+    return ValueError(
+        f"store must be a file that find_brake_families wrote, got {path} ({reason}): give another "
+        f"name"
+    )
 
 
 def _resume(survey: _Survey, record: dict[str, Any], path: Path) -> None:
-    """Takes up the search as a store left it: families are followed again, from the same returns."""
+    """Takes up the search as a store left it: families are followed again, from the same
+    returns.
+    """
     for i, family in enumerate(record["families"]):
         theta1, theta2, period = map(float, family["seed"])
         orbit = find_orbit(survey.pendulum, theta1, guess=(theta2, period))
@@ -453,17 +505,23 @@ def _check_numbers(place: str, value: Any, count: int) -> None:
 
 
 def _check_search(record: dict[str, Any], max_period: float) -> None:
-    """Refuses slices that this search would not look at first, and families that none of their returns begins."""
+    """Refuses slices that this search would not look at first, and families that none of their
+    returns begins.
+    """
     wanted = [angle for level in range(_MOST_LEVELS) for angle in _angles(level)]
     returns = set()
     for i, one in enumerate(record["slices"]):
         if i >= len(wanted) or one["theta1"] != wanted[i]:
-            raise ValueError(f"slices[{i}].theta1 is {one['theta1']:.10g}, which is not the next one")
+            raise ValueError(
+                f"slices[{i}].theta1 is {one['theta1']:.10g}, which is not the next one"
+            )
         for name in ("motions", "rows", "open_cells", "lost"):
             check_least(f"slices[{i}].{name}", one[name], 0)
         for theta2, period in one["returns"]:
             if not (0 < period <= max_period * (1 + 2 * BEYOND) and abs(theta2) < 1.001 * math.pi):
-                raise ValueError(f"slices[{i}].returns has ({theta2:.10g}, {period:.10g}), outside of the search")
+                raise ValueError(
+                    f"slices[{i}].returns has ({theta2:.10g}, {period:.10g}), outside of the search"
+                )
             returns.add((one["theta1"], theta2, period))
     for i, one in enumerate(record["families"]):
         if tuple(one["seed"]) not in returns or not 0 <= one["level"] < _MOST_LEVELS:

@@ -1,4 +1,6 @@
-"""The track of a family over the square of releases, and which returns and passages belong together."""
+"""The track of a family over the square of releases, and which returns and passages belong
+together.
+"""
 
 from dataclasses import dataclass
 
@@ -7,22 +9,23 @@ import numpy as np
 from dpend.orbits.curve import away_from, way_to
 from dpend.orbits.family import Family
 
-# Points along families lie no further apart than this [arclength], so that chords between them are true to the second
-# [rad, and log of the period], or to the third of their length where releases run faster than arclength: what is nearer
-# to a chord belongs to its family.
+# Points along families lie no further apart than this [arclength], so that chords between them are
+# true to the second [rad, and log of the period], or to the third of their length where releases
+# run faster than arclength: what is nearer to a chord belongs to its family.
 STEP, NEAR, _BENT = 0.02, 3e-3, 0.05
-# What following a family takes in time steps of a motion, point by point, and holding a return against its
-# chords: for all of them, and one more for so many each.
+# What following a family takes in time steps of a motion, point by point, and holding a return
+# against its chords: for all of them, and one more for so many each.
 STEPS_PER_POINT, _STEPS_TO_HOLD, _CHORDS_PER_STEP = 2500, 5, 30
 
-# In a slice, where a curve that runs along it makes more of the same error, partners are this close; where it turns
-# back, two passages of one family.
+# In a slice, where a curve that runs along it makes more of the same error, partners are this
+# close; where it turns back, two passages of one family.
 _PARTNER, _PAIR = 0.03, 0.1
 
 
 @dataclass(frozen=True)
 class Track:
-    """A family, how it was found, and all its curves of releases: as it is, at the other rest, and in the mirror.
+    """A family, how it was found, and all its curves of releases: as it is, at the other rest, and
+    in the mirror.
 
     Attributes:
         seed: the release (theta1, theta2) and period that it was followed from.
@@ -40,13 +43,14 @@ class Track:
         orbits = family.orbits
         time = np.log(np.asarray(orbits.period))
         own, other = (
-            np.column_stack([np.asarray(x.theta1), np.asarray(x.theta2), time]) for x in (orbits.state, orbits.dual)
+            np.column_stack([np.asarray(x.theta1), np.asarray(x.theta2), time])
+            for x in (orbits.state, orbits.dual)
         )
         flip = np.array([-1.0, -1.0, 1.0])
         curves = [own, own * flip] + ([other, other * flip] if family.symmetry == "brake" else [])
         chords = [np.stack([curve[:-1], curve[1:]], axis=1) for curve in curves]
-        # Beyond a branch point a curve goes on with its own orbits at their other rests, in the mirror or not; beyond
-        # an equilibrium with its own mirror image.
+        # Beyond a branch point a curve goes on with its own orbits at their other rests, in the
+        # mirror or not; beyond an equilibrium with its own mirror image.
         for end, place in zip(family.ends, (0, -1), strict=True):
             if end in ("branch point", "normal mode"):
                 images = [other[place], -other[place]] if end == "branch point" else [-own[place]]
@@ -55,15 +59,24 @@ class Track:
         return Track(family, seed, level, np.concatenate(chords))
 
     def holds(self, release: np.ndarray) -> bool:
-        """Whether a point (theta1, theta2, log of the period) lies as near to a chord as the curve may be."""
+        """Whether a point (theta1, theta2, log of the period) lies as near to a chord as the curve
+        may be.
+        """
         away, lengths = away_from(self.chords[:, 0], self.chords[:, 1], release)
         return bool(np.any(away < np.maximum(NEAR, _BENT * lengths)))
 
     def is_same(self, other: "Track") -> bool:
-        """Whether two were followed along one family: most of the other's orbits lie on this one's curves."""
+        """Whether two were followed along one family: most of the other's orbits lie on this one's
+        curves.
+        """
         orbits = other.family.orbits
         points = np.stack(
-            [np.asarray(orbits.theta1), np.asarray(orbits.theta2), np.log(np.asarray(orbits.period))], axis=1
+            [
+                np.asarray(orbits.theta1),
+                np.asarray(orbits.theta2),
+                np.log(np.asarray(orbits.period)),
+            ],
+            axis=1,
         )
         return bool(np.mean([self.holds(point) for point in points]) > 0.5)
 
@@ -76,7 +89,10 @@ class Track:
         """(theta2, period) where it passes a slice, shape (n, 2)."""
         start, end = self.chords[:, 0], self.chords[:, 1]
         turns = np.round((start[:, 0] - theta1) / (2 * np.pi))
-        before, after = start[:, 0] - theta1 - 2 * np.pi * turns, end[:, 0] - theta1 - 2 * np.pi * turns
+        before, after = (
+            start[:, 0] - theta1 - 2 * np.pi * turns,
+            end[:, 0] - theta1 - 2 * np.pi * turns,
+        )
         (index,) = np.nonzero((before < 0) != (after < 0))
         share = before[index] / (before[index] - after[index])
         point = start[index] + share[:, None] * (end[index] - start[index])
@@ -91,7 +107,9 @@ def _bridge(point: np.ndarray, images: np.ndarray) -> np.ndarray:
 
 def _apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Distances between all pairs (theta2, period) [rad, and log of the period]."""
-    one, other = (np.column_stack([0 * each[:, 0], each[:, 0], np.log(each[:, 1])]) for each in (one, other))
+    one, other = (
+        np.column_stack([0 * each[:, 0], each[:, 0], np.log(each[:, 1])]) for each in (one, other)
+    )
     return np.asarray(np.linalg.norm(way_to(one[:, None], other), axis=-1))
 
 

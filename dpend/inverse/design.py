@@ -1,15 +1,18 @@
 """A pendulum for a wanted orbit: parameters found by the derivatives of the orbits that they have.
 
-The unknowns are x = ln(parameter/its start), one for each that is free, so that a factor counts alike up or down and
-for lengths, masses and gravity. Every look at x follows the branches from their normal modes anew (`find_orbit`), and
-the implicit function theorem at the root gives what is known of the orbits as functions of x: no iteration is
-differentiated, and one compiled program serves all branches, losses and free parameters.
+The unknowns are x = ln(parameter/its start), one for each that is free, so that a factor counts
+alike up or down and for lengths, masses and gravity. Every look at x follows the branches from
+their normal modes anew (`find_orbit`), and the implicit function theorem at the root gives what is
+known of the orbits as functions of x: no iteration is differentiated, and one compiled program
+serves all branches, losses and free parameters.
 
-- goal `zero`: of the solutions of loss = 0 within the bounds the nearest one, the least |x|^2/2. Newton's method on the
-  Lagrange conditions (sequential quadratic programming): each step is the nearest solution of the linearised equations
-  within the bounds. As many equations as unknowns leave plain Newton.
-- goal `minimum`: optax's L-BFGS, projected onto the bounds. Its steps are combinations of gradients, so that x stays
-  at right angles to whatever the loss does not depend on: of a scale that does not matter the nearest value is kept.
+- goal `zero`: of the solutions of loss = 0 within the bounds the nearest one, the least |x|^2/2.
+  Newton's method on the Lagrange conditions (sequential quadratic programming): each step is the
+  nearest solution of the linearised equations within the bounds. As many equations as unknowns
+  leave plain Newton.
+- goal `minimum`: optax's L-BFGS, projected onto the bounds. Its steps are combinations of
+  gradients, so that x stays at right angles to whatever the loss does not depend on: of a scale
+  that does not matter the nearest value is kept.
 
 Both step back where an orbit is not to be had, and say so if that is where they are stopped.
 """
@@ -41,9 +44,11 @@ from dpend.status import Status, message
 
 GOALS = ("zero", "minimum")
 
-# Without bounds a parameter may grow and shrink by this factor: as far as branches are known to be followed.
+# Without bounds a parameter may grow and shrink by this factor: as far as branches are known to be
+# followed.
 _FACTOR = 10.0
-# Below pi [rad] by more than rounding, and where theta1 may get by itself: the branches end at the former.
+# Below pi [rad] by more than rounding, and where theta1 may get by itself: the branches end at the
+# former.
 _LARGEST_ANGLE, _LARGEST_WITHOUT_BOUNDS = math.pi * (1 - 1e-12), 0.999 * math.pi
 
 
@@ -58,9 +63,10 @@ class Design:
         theta1: their release angles [rad].
         loss: its value, a scalar or as many as there are equations.
         distance: root of the sum of squares of ln(parameter/start).
-        sensitivities: derivatives with respect to the logarithm of each of l1, l2, m1, m2, g and theta1, free or not:
-            `sensitivities["loss"]["l1"]` is d loss/d ln l1; beside `loss` there are `theta2` [rad], `period` [s] and
-            `kappa`, of one orbit scalars, of several one a branch.
+        sensitivities: derivatives with respect to the logarithm of each of l1, l2, m1, m2, g and
+            theta1, free or not: `sensitivities["loss"]["l1"]` is d loss/d ln l1; beside `loss`
+            there are `theta2` [rad], `period` [s] and `kappa`, of one orbit scalars, of several one
+            a branch.
         iterations: steps taken, of all searches that were begun.
         looks: how often the orbits were solved for.
         status: a value of `Status`.
@@ -91,13 +97,17 @@ class Design:
 
 _MESSAGES = {
     Status.CONVERGED: "Found.",
-    Status.MAX_ITERATIONS: "The search did not converge in the allowed iterations, or stalled: start from the pendulum "
+    Status.MAX_ITERATIONS: "The search did not converge in the allowed iterations, or stalled: "
+    "start from the pendulum "
     "it came to.",
-    Status.LEFT_BRANCH: "The search was stopped where the branch cannot be followed to this release: change the start, "
+    Status.LEFT_BRANCH: "The search was stopped where the branch cannot be followed to this "
+    "release: change the start, "
     "or the bounds.",
-    Status.NO_SUCH_ORBIT: "The search was stopped where the branch ends without reaching this release: change the "
+    Status.NO_SUCH_ORBIT: "The search was stopped where the branch ends without reaching this "
+    "release: change the "
     "start, or the bounds.",
-    Status.NO_SOLUTION: "No solution was found within the bounds: the least sum of squares near the start is returned.",
+    Status.NO_SOLUTION: "No solution was found within the bounds: the least sum of squares near "
+    "the start is returned.",
 }
 
 
@@ -114,50 +124,59 @@ def design_pendulum(
 ) -> Design:
     """The pendulum whose orbit has a wanted property, nearest to `pendulum`.
 
-    `goal="zero"` solves loss = 0; where there are more free parameters than equations it takes the solution with the
-    least sum of squares of ln(parameter/start), by the Lagrange conditions, which hold at the nearest solution, and at
-    others only if the solutions are strongly bent. `goal="minimum"` makes the loss as small as it gets near the start.
-    Both find what Newton's method and descent lead to: where there are several, not always the best. For instance
+    `goal="zero"` solves loss = 0; where there are more free parameters than equations it takes the
+    solution with the least sum of squares of ln(parameter/start), by the Lagrange conditions, which
+    hold at the nearest solution, and at others only if the solutions are strongly bent.
+    `goal="minimum"` makes the loss as small as it gets near the start. Both find what Newton's
+    method and descent lead to: where there are several, not always the best. For instance
 
         lambda orbit: orbit.period - 1.0                          # 1 s
-        lambda orbit: orbit.kappa                                 # in the middle of the stable range
-        lambda slow, fast: slow.period - 2 * fast.period          # branch=("in-phase", "anti-phase")
-        lambda wide, small: wide.period - small.period            # branch=("in-phase",) * 2, theta1=(1.0, 0.1)
+        lambda orbit: orbit.kappa                            # in the middle of the stable range
+        lambda slow, fast: slow.period - 2 * fast.period     # branch=("in-phase", "anti-phase")
+        lambda wide, small: wide.period - small.period       # two of "in-phase", theta1=(1.0, 0.1)
 
     Arguments:
-        loss: of one orbit, or of as many as there are branches, traceable: a scalar or, of goal `zero`, a vector of as
-            many equations; the orbit's `pendulum` carries derivatives too, so that `normal_modes(orbit.pendulum)` and
-            its like may be asked. It is compiled once for each function: define it once, not in a loop.
+        loss: of one orbit, or of as many as there are branches, traceable: a scalar or, of goal
+            `zero`, a vector of as many equations; the orbit's `pendulum` carries derivatives too,
+            so that `normal_modes(orbit.pendulum)` and its like may be asked. It is compiled once
+            for each function: define it once, not in a loop.
         pendulum: to start from.
-        free: names among l1, l2, m1, m2, g and theta1. Scales that do not matter (both masses) may be free: the nearest
-            solution leaves them as they are.
-        branch: `in-phase` or `anti-phase`, or a sequence of them, one for each orbit that the loss is told.
-        theta1: release angle [rad], between 0 and pi, or one for each branch; the start, if it is free, which only one
-            angle can be.
+        free: names among l1, l2, m1, m2, g and theta1. Scales that do not matter (both masses) may
+            be free: the nearest solution leaves them as they are.
+        branch: `in-phase` or `anti-phase`, or a sequence of them, one for each orbit that the loss
+            is told.
+        theta1: release angle [rad], between 0 and pi, or one for each branch; the start, if it is
+            free, which only one angle can be.
         goal: `zero` or `minimum`.
-        bounds: {name: (low, high)} in the parameter's unit; a tenth and ten times the start where none are given, and
-            for theta1 no more than pi.
+        bounds: {name: (low, high)} in the parameter's unit; a tenth and ten times the start where
+            none are given, and for theta1 no more than pi.
         max_iterations: steps at most.
     Returns:
-        Design. If its status is not `Status.CONVERGED` it holds the best so far: `NO_SOLUTION` if the bounds hold none
-        near the start (the least sum of squares is returned), `LEFT_BRANCH` or `NO_SUCH_ORBIT` if it was stopped where
-        a branch does not get to its release.
+        Design. If its status is not `Status.CONVERGED` it holds the best so far: `NO_SOLUTION` if
+        the bounds hold none near the start (the least sum of squares is returned), `LEFT_BRANCH` or
+        `NO_SUCH_ORBIT` if it was stopped where a branch does not get to its release.
     Raises:
-        ValueError: an unknown or repeated name in free; more equations than free parameters; goal `minimum` of a
-            vector; bounds not positive, of a parameter that is not free, or without the start; an unknown branch or
-            goal; theta1 out of range; g not positive; values traced by `jit`.
+        ValueError: an unknown or repeated name in free; more equations than free parameters; goal
+            `minimum` of a vector; bounds not positive, of a parameter that is not free, or without
+            the start; an unknown branch or goal; theta1 out of range; g not positive; values traced
+            by `jit`.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
     function("loss", loss, "an orbit", "lambda orbit: orbit.kappa")
     check_pendulum(pendulum)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((pendulum, theta1))):
-        raise ValueError("pendulum and theta1 must be numbers, not traced by jit or a derivative: design outside of it")
+        raise ValueError(
+            "pendulum and theta1 must be numbers, not traced by jit or a derivative: design "
+            "outside of it"
+        )
     start = swinging_pendulum(pendulum)
     branches, angles = _orbits_asked(branch, theta1)
     names = _names(free)
     if "theta1" in names and not np.isscalar(theta1) and len(angles) > 1:
-        raise ValueError(f"theta1 can be free only if it is one angle, got {len(angles)}: leave it out of free")
+        raise ValueError(
+            f"theta1 can be free only if it is one angle, got {len(angles)}: leave it out of free"
+        )
     goal, max_iterations = one_of("goal", goal, GOALS), integer("max_iterations", max_iterations)
     values = dict(zip(PARAMETERS, [*jax.tree.leaves(start), angles[0]], strict=True))
     low, high = _box(values, names, bounds)
@@ -165,10 +184,13 @@ def design_pendulum(
     first = problem.at(np.zeros(len(PARAMETERS)))
     equations = first.value.size
     if goal == "minimum" and equations != 1:
-        raise ValueError(f"loss must be a scalar for a minimum, got {equations} values: add them up")
+        raise ValueError(
+            f"loss must be a scalar for a minimum, got {equations} values: add them up"
+        )
     if goal == "zero" and not 1 <= equations <= len(names):
         raise ValueError(
-            f"free must name as many parameters as there are equations or more, got {len(names)} for {equations}: name "
+            f"free must name as many parameters as there are equations or more, got {len(names)} "
+            f"for {equations}: name "
             "others too, or ask for the minimum of a scalar"
         )
     if not first.sound:
@@ -184,43 +206,59 @@ def _orbits_asked(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[floa
     branches = (branch,) if isinstance(branch, str) else branch
     if not isinstance(branches, Sequence) or not branches:
         raise ValueError(
-            f"branch must be one of {', '.join(BRANCHES)}, or a sequence of them, got {shown(branch)}: give such"
+            f"branch must be one of {', '.join(BRANCHES)}, or a sequence of them, got "
+            f"{shown(branch)}: give such"
         )
     branches = tuple(one_of("branch", one, BRANCHES) for one in branches)
-    listed = isinstance(theta1, (list, tuple)) or (isinstance(theta1, (np.ndarray, jax.Array)) and theta1.ndim > 0)
+    listed = isinstance(theta1, (list, tuple)) or (
+        isinstance(theta1, (np.ndarray, jax.Array)) and theta1.ndim > 0
+    )
     angles = tuple(theta1) if listed else (theta1,) * len(branches)
     if len(angles) != len(branches):
         raise ValueError(
-            f"theta1 must be one angle, or one a branch, got {len(angles)} for {len(branches)}: give {len(branches)}"
+            f"theta1 must be one angle, or one a branch, got {len(angles)} for {len(branches)}: "
+            f"give {len(branches)}"
         )
     known = tuple(known_number("theta1", angle, unit="rad") for angle in angles)
     for angle in known:
         if not 0 < angle < _LARGEST_ANGLE:
-            raise ValueError(f"theta1 must be between 0 and pi [rad], got {angle:g}: give another theta1")
+            raise ValueError(
+                f"theta1 must be between 0 and pi [rad], got {angle:g}: give another theta1"
+            )
     return branches, known
 
 
 def _names(free: Any) -> tuple[str, ...]:
     names = (free,) if isinstance(free, str) else free
-    sound = isinstance(names, Sequence) and all(isinstance(name, str) and name in PARAMETERS for name in names)
+    sound = isinstance(names, Sequence) and all(
+        isinstance(name, str) and name in PARAMETERS for name in names
+    )
     if not sound or not names:
         raise ValueError(
-            f"free must name one or more of {', '.join(PARAMETERS)}, got {shown(free)}: give names like ('l1', 'l2')"
+            f"free must name one or more of {', '.join(PARAMETERS)}, got {shown(free)}: give names "
+            f"like ('l1', 'l2')"
         )
     if len(set(names)) < len(names):
         raise ValueError(f"free must name each parameter once, got {shown(free)}: leave one out")
     return tuple(names)
 
 
-def _box(values: dict[str, float], names: tuple[str, ...], bounds: Any) -> tuple[np.ndarray, np.ndarray]:
+def _box(
+    values: dict[str, float], names: tuple[str, ...], bounds: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """The bounds of x."""
     given = {} if bounds is None else bounds
     if not isinstance(given, Mapping):
-        raise ValueError(f"bounds must be a dictionary like {{'l1': (0.1, 0.5)}}, got {shown(bounds)}: give one")
+        raise ValueError(
+            f"bounds must be a dictionary like {{'l1': (0.1, 0.5)}}, got {shown(bounds)}: give one"
+        )
     low, high = np.zeros(len(PARAMETERS)), np.zeros(len(PARAMETERS))
     for name in given:
         if name not in names:
-            raise ValueError(f"bounds must be of parameters that are free, got {name!r}: free are {', '.join(names)}")
+            raise ValueError(
+                f"bounds must be of parameters that are free, got {name!r}: free are "
+                f"{', '.join(names)}"
+            )
     for name in names:
         start, i = values[name], PARAMETERS.index(name)
         pair = given.get(name, (start / _FACTOR, start * _FACTOR))
@@ -230,17 +268,22 @@ def _box(values: dict[str, float], names: tuple[str, ...], bounds: Any) -> tuple
         least, most = (known_number(f"bounds of {name}", bound, positive=True) for bound in pair)
         if not least < most or not least <= start <= most:
             raise ValueError(
-                f"bounds of {name} must be two numbers with the start, {start:g}, between them, got "
+                f"bounds of {name} must be two numbers with the start, {start:g}, between them, "
+                f"got "
                 f"({least:g}, {most:g}): give others, or another start"
             )
         if name == "theta1" and not most < _LARGEST_ANGLE:
-            raise ValueError(f"bounds of theta1 must be below pi [rad], got {most:g}: give another upper bound")
+            raise ValueError(
+                f"bounds of theta1 must be below pi [rad], got {most:g}: give another upper bound"
+            )
         low[i], high[i] = math.log(least / start), math.log(most / start)
     return low, high
 
 
 def _result(problem: Problem, look: Look, steps: int, status: int) -> Design:
-    parameters = [np.array([*jax.tree.leaves(orbit.pendulum), orbit.theta1]) for orbit in look.orbits]
+    parameters = [
+        np.array([*jax.tree.leaves(orbit.pendulum), orbit.theta1]) for orbit in look.orbits
+    ]
     rates = [np.asarray(rate) * row for rate, row in zip(look.slopes, parameters, strict=True)]
     single = len(rates) == 1
     periods = np.array([float(orbit.period) for orbit in look.orbits])
@@ -260,7 +303,8 @@ def _result(problem: Problem, look: Look, steps: int, status: int) -> Design:
         loss=jnp.asarray(look.value[0] if look.value.size == 1 else look.value),
         distance=jnp.asarray(np.linalg.norm(look.x)),
         sensitivities={
-            name: {key: jnp.asarray(rows[..., i]) for i, key in enumerate(PARAMETERS)} for name, rows in table.items()
+            name: {key: jnp.asarray(rows[..., i]) for i, key in enumerate(PARAMETERS)}
+            for name, rows in table.items()
         },
         iterations=jnp.asarray(steps),
         looks=jnp.asarray(problem.looks),

@@ -1,4 +1,6 @@
-"""The least squares of windows that meet: one banded linear problem an iteration, and the descent."""
+"""The least squares of windows that meet: one banded linear problem an iteration, and the
+descent.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -39,7 +41,9 @@ class _Linear(NamedTuple):
 
     misses: _Misses
     extra: float  # what the fields themselves cost
-    normal: np.ndarray  # (K, 7, 7), of each window's angles with respect to its node and the three logarithms
+    normal: (
+        np.ndarray
+    )  # (K, 7, 7), of each window's angles with respect to its node and the three logarithms
     gradient: np.ndarray  # (K, 7)
     by_node: np.ndarray  # (K - 1, 4, 4), of the windows' ends
     by_logs: np.ndarray  # (K - 1, 4, 3)
@@ -73,15 +77,29 @@ def _linear(problem: Problem, point: Point, steps: int, prior: float = 0.0) -> _
     normal[0, :4, :4] += np.diag(1.0 - free)
     gradient[0, :4] *= free
     within = bool(np.all(np.abs(fields) <= FARTHEST))
-    return _Linear(misses, prior * float(fields @ fields), normal, gradient, by_node, by_logs, corner, slope, within)
+    return _Linear(
+        misses,
+        prior * float(fields @ fields),
+        normal,
+        gradient,
+        by_node,
+        by_logs,
+        corner,
+        slope,
+        within,
+    )
 
 
 class _Step(NamedTuple):
     nodes: np.ndarray
     fields: np.ndarray
-    information: np.ndarray  # of the fields, nodes eliminated: inverse of their covariance over the noise's variance
+    information: (
+        np.ndarray
+    )  # of the fields, nodes eliminated: inverse of their covariance over the noise's variance
     response: np.ndarray  # (F, 4, K), of the nodes to the fields
-    alone: np.ndarray  # (4, 4), covariance of the first node with the fields held, over the noise's variance
+    alone: (
+        np.ndarray
+    )  # (4, 4), covariance of the first node with the fields held, over the noise's variance
 
 
 # Off-diagonals on either side of the banded matrix.
@@ -93,8 +111,8 @@ ROUNDED = 1e-13
 def _banded(linear: _Linear, price: np.ndarray, damping: float) -> np.ndarray:
     """The symmetric matrix of the unknowns x_0, y_0, x_1, y_1, ..., x_(K-1) by diagonals.
 
-    x_k is the move of node k and y_k the multiplier of the joint behind window k, of which the price is the
-    reciprocal weight: at price zero the joint is closed.
+    x_k is the move of node k and y_k the multiplier of the joint behind window k, of which the
+    price is the reciprocal weight: at price zero the joint is closed.
     """
     count = len(linear.normal)
     matrix = np.zeros((2 * _BAND + 1, 8 * count))
@@ -115,11 +133,14 @@ def _banded(linear: _Linear, price: np.ndarray, damping: float) -> np.ndarray:
     return matrix[:, : 8 * count - 4]
 
 
-def _step(problem: Problem, linear: _Linear, price: np.ndarray, least: float, damping: float = 0.0) -> _Step:
+def _step(
+    problem: Problem, linear: _Linear, price: np.ndarray, least: float, damping: float = 0.0
+) -> _Step:
     """The move that solves the linearised problem.
 
     Arguments:
-        price: (4, K - 1), of the joints' misses: the squares of those that cost as much as 1 rad of an angle.
+        price: (4, K - 1), of the joints' misses: the squares of those that cost as much as 1 rad of
+            an angle.
         least: the fields move only along axes with at least so much information.
         damping: Levenberg and Marquardt's.
     Raises:
@@ -136,7 +157,9 @@ def _step(problem: Problem, linear: _Linear, price: np.ndarray, least: float, da
     sides[:-1, 4:, free] = linear.misses.joints.T
     sides[0, :4, free + 1 :] = np.eye(4)
     sides = sides.reshape(8 * count, -1)[:-4]
-    solved = solve_banded((_BAND, _BAND), _banded(linear, price, damping), sides, check_finite=False)
+    solved = solve_banded(
+        (_BAND, _BAND), _banded(linear, price, damping), sides, check_finite=False
+    )
     if not np.all(np.isfinite(solved)):
         raise np.linalg.LinAlgError("the nodes are not determined")
     border, short = sides[:, :free], solved[:, free]
@@ -144,27 +167,39 @@ def _step(problem: Problem, linear: _Linear, price: np.ndarray, least: float, da
     information = 0.5 * (information + information.T)
     weights, axes = np.linalg.eigh(information + damping * np.diag(np.diag(linear.corner)))
     known = weights > max(least, ROUNDED * float(np.max(np.abs(linear.corner), initial=0.0)))
-    fields = axes[:, known] @ ((axes[:, known].T @ (border.T @ short - linear.slope)) / weights[known])
-    moves = np.vstack([-solved[:, : free + 1], np.zeros((4, free + 1))]).reshape(count, 8, free + 1)[:, :4].T
+    fields = axes[:, known] @ (
+        (axes[:, known].T @ (border.T @ short - linear.slope)) / weights[known]
+    )
+    moves = (
+        np.vstack([-solved[:, : free + 1], np.zeros((4, free + 1))])
+        .reshape(count, 8, free + 1)[:, :4]
+        .T
+    )
     response = moves[:free]
     alone = solved[:4, free + 1 :] * np.outer(~problem.held, ~problem.held)
-    return _Step(moves[free] + np.tensordot(fields, response, 1), fields, information, response, alone)
+    return _Step(
+        moves[free] + np.tensordot(fields, response, 1), fields, information, response, alone
+    )
 
 
-# What it costs a window's end to miss the next node by this [rad, and in rad/s times the slow frequency] is what an
-# angle's residual of the same size does; one round each, before the joints are closed.
+# What it costs a window's end to miss the next node by this [rad, and in rad/s times the slow
+# frequency] is what an angle's residual of the same size does; one round each, before the joints
+# are closed.
 PRICES = (0.3, 0.03, 0.003)
-# In these rounds it costs as much as a residual of the noise's size to take a field's logarithm this far from its
-# start: what the data say weighs more, where they do; the last iterations do without.
+# In these rounds it costs as much as a residual of the noise's size to take a field's logarithm
+# this far from its start: what the data say weighs more, where they do; the last iterations do
+# without.
 _FAR = 0.5
 
 _MOST_TRIALS, _MOST_ITERATIONS = 25, 25
-# A round is over when an iteration that is damped by no more than the second gains less than the first, of the cost.
+# A round is over when an iteration that is damped by no more than the second gains less than the
+# first, of the cost.
 _LITTLE, _FREELY = 0.1, 1e-2
-# The last iteration moves no parameter by more than this share of its standard error, or by rounding, which data
-# without noise show as small moves that do not shrink.
+# The last iteration moves no parameter by more than this share of its standard error, or by
+# rounding, which data without noise show as small moves that do not shrink.
 _TOLERANCE, _ROUNDING, _NOISE = 1e-4, 1e-12, 1e-8
-# Joints that miss by this [rad, rad/s] are closed: rounding over a window at tens of rad/s is some 1e-13.
+# Joints that miss by this [rad, rad/s] are closed: rounding over a window at tens of rad/s is some
+# 1e-13.
 _CLOSED = 1e-9
 
 
@@ -185,8 +220,12 @@ def _moved_by(point: Point, step: _Step) -> Point:
     return Point(point.nodes + step.nodes, point.fields + step.fields)
 
 
-def descent(problem: Problem, point: Point, price: float, settings: Settings) -> tuple[Point, float, int]:
-    """Levenberg and Marquardt's iteration with open joints at this price; the cost it came to, and its evaluations."""
+def descent(
+    problem: Problem, point: Point, price: float, settings: Settings
+) -> tuple[Point, float, int]:
+    """Levenberg and Marquardt's iteration with open joints at this price; the cost it came to, and
+    its evaluations.
+    """
     prices = np.broadcast_to(squared_price(price, settings.rate), (4, len(problem.times) - 1))
     prior, least = (settings.noise / _FAR) ** 2, settings.noise**2
     linear = _linear(problem, point, settings.steps[0], prior)
@@ -211,9 +250,11 @@ def descent(problem: Problem, point: Point, price: float, settings: Settings) ->
 
 
 def solved(problem: Problem, point: Point, settings: Settings) -> Found:
-    """Gauss and Newton's iteration with closed joints, at the fine step, from a point whose joints nearly are.
+    """Gauss and Newton's iteration with closed joints, at the fine step, from a point whose joints
+    nearly are.
 
-    Where no motion of this kind passes through the data it goes astray; the first point is returned then.
+    Where no motion of this kind passes through the data it goes astray; the first point is returned
+    then.
     """
     closed, least = np.zeros((4, len(problem.times) - 1)), settings.noise**2
     first = _linear(problem, point, settings.steps[1])
@@ -223,7 +264,9 @@ def solved(problem: Problem, point: Point, settings: Settings) -> Found:
         try:
             step = _step(problem, linear, closed, least)
         except np.linalg.LinAlgError:
-            return lost._replace(iterations=count, status=Status.SINGULAR if count == 1 else lost.status)
+            return lost._replace(
+                iterations=count, status=Status.SINGULAR if count == 1 else lost.status
+            )
         error = math.sqrt(linear.misses.squares / problem.freedom)
         size = math.sqrt(max(float(step.fields @ step.information @ step.fields), 0.0))
         gap = float(np.max(np.abs(linear.misses.joints), initial=0.0))
@@ -238,13 +281,15 @@ def solved(problem: Problem, point: Point, settings: Settings) -> Found:
     return lost._replace(iterations=_MOST_ITERATIONS + 1)
 
 
-# The error of the integration is to move the fields by no more than this share of a standard error; so often is the
-# step halved for it.
+# The error of the integration is to move the fields by no more than this share of a standard error;
+# so often is the step halved for it.
 _SMALL_SHARE, _HALVINGS = 0.1, 3
 
 
 def refined(problem: Problem, found: Found, settings: Settings) -> tuple[Found, Settings, float]:
-    """A solution whose integration steps are short enough for its noise, and how much half of them would move it."""
+    """A solution whose integration steps are short enough for its noise, and how much half of them
+    would move it.
+    """
     for halving in range(_HALVINGS + 1):
         if found.step is None:
             return found, settings, math.nan

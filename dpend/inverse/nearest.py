@@ -23,7 +23,8 @@ Loss = Callable[..., Any]
 PARAMETERS = ("l1", "l2", "m1", "m2", "g", "theta1")
 _THETA1 = PARAMETERS.index("theta1")
 
-# The longest step [of a logarithm], and the one below which steps are Newton's own and need no search.
+# The longest step [of a logarithm], and the one below which steps are Newton's own and need no
+# search.
 _LONGEST, _LOCAL = 0.5, 1e-5
 # Steps this short end the iteration: an error of the equations is its square.
 _SMALL, _SMALL_STEP_DOWN = 1e-9, 1e-8
@@ -32,12 +33,15 @@ _STALLED = 1e-6
 _LEAST_DAMPING = 2.0**-12
 # Equations that are down to this share of where they began have a solution there.
 _SOLVED = 1e-8
-# Places at which one equation for one unknown is looked at on either side of the start for a change of sign.
+# Places at which one equation for one unknown is looked at on either side of the start for a change
+# of sign.
 _PIECES = 16
 
 
 class Look(NamedTuple):
-    """What is known at one point; if an orbit is not to be had, its status and no more that counts."""
+    """What is known at one point; if an orbit is not to be had, its status and no more that
+    counts.
+    """
 
     x: np.ndarray  # (6,)
     value: np.ndarray  # (k,)
@@ -88,7 +92,9 @@ class Problem:
 
 
 @partial(jax.jit, static_argnames="loss")
-def _judged(loss: Loss, orbits: tuple[PeriodicOrbit, ...], rates: tuple[Any, ...]) -> tuple[Scalar, Scalar]:
+def _judged(
+    loss: Loss, orbits: tuple[PeriodicOrbit, ...], rates: tuple[Any, ...]
+) -> tuple[Scalar, Scalar]:
     """The loss as a vector, and its derivatives with respect to the logarithms of `PARAMETERS`."""
 
     def at(logs: Scalar) -> Scalar:
@@ -100,7 +106,9 @@ def _judged(loss: Loss, orbits: tuple[PeriodicOrbit, ...], rates: tuple[Any, ...
 
 
 def _moved(orbit: PeriodicOrbit, rate: Scalar, logs: Scalar) -> PeriodicOrbit:
-    """A centred orbit after a small change of ln parameters, to the first order, which is all that is asked of it."""
+    """A centred orbit after a small change of ln parameters, to the first order, which is all that
+    is asked of it.
+    """
     parameters = jnp.stack([*jax.tree.leaves(orbit.pendulum), orbit.theta1])
     theta2, log_time, kappa, log_abs_kappa = rate @ (parameters * logs)
     theta1, *fields = (parameters * jnp.exp(logs))[jnp.array([_THETA1, 0, 1, 2, 3, 4])]
@@ -126,14 +134,21 @@ class _Step(NamedTuple):
 
 
 def _quadratic(
-    hessian: np.ndarray, slope: np.ndarray, value: np.ndarray, jacobian: np.ndarray, low: np.ndarray, high: np.ndarray,
+    hessian: np.ndarray,
+    slope: np.ndarray,
+    value: np.ndarray,
+    jacobian: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
     slack: float = 0.0,
-) -> _Step | None:  # fmt: skip
-    """The step d that minimises slope.d + d.hessian.d/2 with value + jacobian d = 0 and low <= d <= high; None if the
-    bounds leave no such step. With `slack` the equations cost their squares over twice of it instead.
+) -> _Step | None:
+    """The step d that minimises slope.d + d.hessian.d/2 with value + jacobian d = 0 and low <= d <=
+    high; None if the bounds leave no such step. With `slack` the equations cost their squares over
+    twice of it instead.
 
-    The bounds that hold are tried, none first: the first choice that satisfies the conditions of Karush, Kuhn and
-    Tucker is the solution, there being one. Of six unknowns 729 small solves at worst.
+    The bounds that hold are tried, none first: the first choice that satisfies the conditions of
+    Karush, Kuhn and Tucker is the solution, there being one. Of six unknowns 729 small solves at
+    worst.
     """
     n, k = len(slope), len(value)
     for sides in sorted(itertools.product((0, -1, 1), repeat=n), key=np.count_nonzero):
@@ -189,9 +204,11 @@ def _nearest(problem: Problem, look: Look, most: int) -> tuple[Look, int, int]:
 
 
 def nearest_of_one(problem: Problem, look: Look, most: int) -> tuple[Look, int, int]:
-    """One equation for one unknown: where Newton's method leads, unless the loss changes sign nearer to the start.
+    """One equation for one unknown: where Newton's method leads, unless the loss changes sign
+    nearer to the start.
 
-    Looked at are places on both sides at even distances, up to the solution, or up to the bounds if there is none.
+    Looked at are places on both sides at even distances, up to the solution, or up to the bounds if
+    there is none.
     """
     (i,) = problem.free
     found, steps, status = _nearest(problem, look, most)
@@ -203,7 +220,9 @@ def nearest_of_one(problem: Problem, look: Look, most: int) -> tuple[Look, int, 
         changes = []
         for side in tuple(last):
             place = side * share * reach
-            trial = problem.at(_with(look.x, problem.free, np.clip([place], problem.low[i], problem.high[i])))
+            trial = problem.at(
+                _with(look.x, problem.free, np.clip([place], problem.low[i], problem.high[i]))
+            )
             if not trial.sound:
                 del last[side]
                 continue
@@ -223,13 +242,16 @@ def nearest_of_one(problem: Problem, look: Look, most: int) -> tuple[Look, int, 
 
 
 def _without_solution(how: int) -> int:
-    """The status of equations of which the least sum of squares has been sought, which ended with `how`."""
+    """The status of equations of which the least sum of squares has been sought, which ended with
+    `how`.
+    """
     return int(Status.NO_SOLUTION) if how == Status.CONVERGED else how
 
 
 def nearest_of_many(problem: Problem, look: Look, most: int) -> tuple[Look, int, int]:
-    """The nearest solution near the start; where Newton's method finds none, the nearest of those that it finds from
-    the least sum of squares, and from where one parameter alone makes one of the equations true.
+    """The nearest solution near the start; where Newton's method finds none, the nearest of those
+    that it finds from the least sum of squares, and from where one parameter alone makes one of the
+    equations true.
     """
     found, steps, status = _nearest(problem, look, most)
     if status == Status.CONVERGED:
@@ -238,8 +260,14 @@ def nearest_of_many(problem: Problem, look: Look, most: int) -> tuple[Look, int,
     steps += more
     found, more, status = _nearest(problem, closest, most)
     steps += more
-    if status != Status.CONVERGED and np.max(np.abs(closest.value)) <= _SOLVED * np.max(np.abs(look.value)):
-        return closest, steps, int(Status.MAX_ITERATIONS)  # a solution, but on the way to the nearest one it stalled
+    if status != Status.CONVERGED and np.max(np.abs(closest.value)) <= _SOLVED * np.max(
+        np.abs(look.value)
+    ):
+        return (
+            closest,
+            steps,
+            int(Status.MAX_ITERATIONS),
+        )  # a solution, but on the way to the nearest one it stalled
     solutions = [found] if status == Status.CONVERGED else []
     for begin in _beginnings(problem, look, most):
         found, more, status = _nearest(problem, begin, most)
@@ -248,14 +276,22 @@ def nearest_of_many(problem: Problem, look: Look, most: int) -> tuple[Look, int,
             solutions.append(found)
     if not solutions:
         return closest, steps, _without_solution(how)
-    return min(solutions, key=lambda one: float(np.linalg.norm(one.x))), steps, int(Status.CONVERGED)
+    return (
+        min(solutions, key=lambda one: float(np.linalg.norm(one.x))),
+        steps,
+        int(Status.CONVERGED),
+    )
 
 
 def _beginnings(problem: Problem, look: Look, most: int) -> Iterator[Look]:
-    """Looks where one parameter alone makes one of the equations true, the others being as at the start."""
+    """Looks where one parameter alone makes one of the equations true, the others being as at the
+    start.
+    """
     for i, equation in itertools.product(problem.free, range(look.value.size)):
         only = np.arange(len(PARAMETERS)) == i
-        alone = replace(problem, low=problem.low * only, high=problem.high * only, equation=equation, looks=0)
+        alone = replace(
+            problem, low=problem.low * only, high=problem.high * only, equation=equation, looks=0
+        )
         start = look._replace(value=look.value[[equation]], jacobian=look.jacobian[[equation]])
         one, _, status = nearest_of_one(alone, start, most)
         problem.looks += alone.looks
@@ -264,7 +300,9 @@ def _beginnings(problem: Problem, look: Look, most: int) -> Iterator[Look]:
 
 
 def _bracketed(problem: Problem, one: Look, other: Look, most: int) -> tuple[Look, int, int]:
-    """The zero between two looks of different sign: Newton's method, halving where it would leave them."""
+    """The zero between two looks of different sign: Newton's method, halving where it would leave
+    them.
+    """
     (i,) = problem.free
     look = min(one, other, key=lambda side: abs(float(side.value[0])))
     ends = {math.copysign(1.0, float(side.value[0])): float(side.x[i]) for side in (one, other)}
@@ -292,10 +330,11 @@ def _with(x: np.ndarray, free: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _searched(problem: Problem, look: Look, step: np.ndarray, weight: float) -> Look:
-    """The look after as much of the step as lowers |x|^2/2 + weight |loss|; one with a failed status if none does.
+    """The look after as much of the step as lowers |x|^2/2 + weight |loss|; one with a failed
+    status if none does.
 
-    Where a step does not, the curvature of the equations is made good before it is halved: a merit as this one would
-    otherwise refuse Newton's steps along a curved solution (Maratos).
+    Where a step does not, the curvature of the equations is made good before it is halved: a merit
+    as this one would otherwise refuse Newton's steps along a curved solution (Maratos).
     """
     free = problem.free
     x, jacobian = look.x[free], look.jacobian[:, free]
@@ -314,7 +353,9 @@ def _searched(problem: Problem, look: Look, step: np.ndarray, weight: float) -> 
         if trial.sound and merit(trial) <= merit(look) + 1e-4 * damping * rate:
             return trial
         if trial.sound:
-            back = np.linalg.lstsq(jacobian, (1 - damping) * look.value - trial.value, rcond=None)[0]
+            back = np.linalg.lstsq(jacobian, (1 - damping) * look.value - trial.value, rcond=None)[
+                0
+            ]
             bent = problem.at(_with(look.x, free, np.clip(trial.x[free] + back, low, high)))
             if bent.sound and merit(bent) <= merit(look) + 1e-4 * damping * rate:
                 return bent
@@ -323,8 +364,12 @@ def _searched(problem: Problem, look: Look, step: np.ndarray, weight: float) -> 
     return look._replace(status=failure)
 
 
-def _updated(hessian: np.ndarray, old: Look, new: Look, free: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-    """The Hessian of |x|^2/2 + multipliers . loss after a step: BFGS, damped to stay positive definite (Powell)."""
+def _updated(
+    hessian: np.ndarray, old: Look, new: Look, free: np.ndarray, multipliers: np.ndarray
+) -> np.ndarray:
+    """The Hessian of |x|^2/2 + multipliers . loss after a step: BFGS, damped to stay positive
+    definite (Powell).
+    """
     step = (new.x - old.x)[free]
     change = step + (new.jacobian - old.jacobian)[:, free].T @ multipliers
     pushed = hessian @ step
@@ -332,7 +377,9 @@ def _updated(hessian: np.ndarray, old: Look, new: Look, free: np.ndarray, multip
     if curvature < 0.2 * has:
         share = 0.8 * has / (has - curvature)
         change = share * change + (1 - share) * pushed
-    return hessian - np.outer(pushed, pushed) / has + np.outer(change, change) / float(step @ change)
+    return (
+        hessian - np.outer(pushed, pushed) / has + np.outer(change, change) / float(step @ change)
+    )
 
 
 class _Scalar(NamedTuple):
@@ -350,17 +397,22 @@ def _square(look: Look) -> _Scalar:
     return _Scalar(0.5 * float(look.value @ look.value), look.jacobian.T @ look.value)
 
 
-def least_on_bounds(problem: Problem, look: Look, most: int, of: Callable[[Look], _Scalar]) -> tuple[Look, int, int]:
-    """The least value near the start, the steps taken, and a status: L-BFGS on what the bounds leave free.
+def least_on_bounds(
+    problem: Problem, look: Look, most: int, of: Callable[[Look], _Scalar]
+) -> tuple[Look, int, int]:
+    """The least value near the start, the steps taken, and a status: L-BFGS on what the bounds
+    leave free.
 
-    A parameter at a bound that the gradient pushes it against is held; whenever others are held than before, L-BFGS
-    begins anew.
+    A parameter at a bound that the gradient pushes it against is held; whenever others are held
+    than before, L-BFGS begins anew.
     """
     begin, update = _lbfgs()
     state, held, fresh = begin(look.x), None, True
     for count in range(most):
         value, gradient = of(look)
-        outwards = ((look.x <= problem.low) & (gradient > 0)) | ((look.x >= problem.high) & (gradient < 0))
+        outwards = ((look.x <= problem.low) & (gradient > 0)) | (
+            (look.x >= problem.high) & (gradient < 0)
+        )
         now = outwards | (problem.low == problem.high)
         if held is None or np.any(now != held):
             state, held, fresh = begin(look.x), now, True
@@ -398,9 +450,15 @@ def _lbfgs() -> tuple[Callable[..., Any], Callable[..., Any]]:
 
 
 def _lower(
-    problem: Problem, look: Look, direction: np.ndarray, gradient: np.ndarray, of: Callable[[Look], _Scalar]
+    problem: Problem,
+    look: Look,
+    direction: np.ndarray,
+    gradient: np.ndarray,
+    of: Callable[[Look], _Scalar],
 ) -> Look:
-    """The look after as much of the direction, bent along the bounds, as lowers the value; else a failed one."""
+    """The look after as much of the direction, bent along the bounds, as lowers the value; else a
+    failed one.
+    """
     damping = min(1.0, _LONGEST / float(np.max(np.abs(direction))))
     value, failure = of(look).value, int(Status.MAX_ITERATIONS)
     while damping >= _LEAST_DAMPING:

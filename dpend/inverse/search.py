@@ -1,4 +1,6 @@
-"""Where the windows of a fit start: from the smoothed data, and window by window where a rod is not seen."""
+"""Where the windows of a fit start: from the smoothed data, and window by window where a rod is not
+seen.
+"""
 
 import math
 from typing import NamedTuple
@@ -18,11 +20,14 @@ class _Start(NamedTuple):
     noise: float
 
 
-# A cubic across spaces this many times the usual one, unless that is a small part of a swing, is not to be trusted.
+# A cubic across spaces this many times the usual one, unless that is a small part of a swing, is
+# not to be trusted.
 _WIDE, _SHORT = 3.5, 0.1
 
 
-def smoothed(problem: Problem, times: np.ndarray, angles: np.ndarray, initial: tuple, rate: float) -> _Start:
+def smoothed(
+    problem: Problem, times: np.ndarray, angles: np.ndarray, initial: tuple, rate: float
+) -> _Start:
     """Nodes from local cubics through the samples about them, and from what is held."""
     count = problem.times.size
     nodes, known, variances = np.zeros((4, count)), np.zeros((2, count), bool), []
@@ -36,15 +41,21 @@ def smoothed(problem: Problem, times: np.ndarray, angles: np.ndarray, initial: t
         spaces = np.diff(when)
         widest = np.max(spaces[cubics.samples[:, :-1]], axis=1)
         known[rod] = widest <= max(_WIDE * float(np.median(spaces)), _SHORT / rate)
-        known[rod] &= cubics.nearest <= widest  # beyond the first and the last sample a cubic knows nothing
+        known[rod] &= (
+            cubics.nearest <= widest
+        )  # beyond the first and the last sample a cubic knows nothing
         nodes[rod], nodes[2 + rod] = cubics.value, cubics.slope
         variances.append(noise**2)
     known[:, 0] |= problem.held[:2] & problem.held[2:]
-    nodes[:, 0] = [node if value is None else value for node, value in zip(nodes[:, 0], initial, strict=True)]
+    nodes[:, 0] = [
+        node if value is None else value for node, value in zip(nodes[:, 0], initial, strict=True)
+    ]
     return _Start(nodes, known, math.sqrt(float(np.mean(variances))))
 
 
-def all_at_once(problem: Problem, start: _Start, settings: Settings, first: int) -> tuple[Point, int]:
+def all_at_once(
+    problem: Problem, start: _Start, settings: Settings, first: int
+) -> tuple[Point, int]:
     """All nodes from the smoothed data, where nearly all are known."""
     point, total = Point(start.nodes, np.zeros(problem.by_free.shape[1])), 0
     for price in PRICES:
@@ -53,27 +64,34 @@ def all_at_once(problem: Problem, start: _Start, settings: Settings, first: int)
     return point, total
 
 
-# This share of the nodes is known where all are tried at once: cubics through a gap may do, and if not it will be seen.
+# This share of the nodes is known where all are tried at once: cubics through a gap may do, and if
+# not it will be seen.
 MOSTLY = 0.9
 
-# What is tried for a rod that nothing is known of: angles, and velocities [of the slow mode's rate] to either side;
-# how many of the best go on.
+# What is tried for a rod that nothing is known of: angles, and velocities [of the slow mode's rate]
+# to either side; how many of the best go on.
 _ANGLES, _VELOCITIES, _STARTS = 24, np.linspace(-4.5, 4.5, 13), 24
-# How many windows there are at first, tried in this order: some two thirds of a swing, of which fewer leave a hidden
-# rod free to go anywhere, and more are not led through by a wrong pendulum; and how many come at a time.
+# How many windows there are at first, tried in this order: some two thirds of a swing, of which
+# fewer leave a hidden rod free to go anywhere, and more are not led through by a wrong pendulum;
+# and how many come at a time.
 FIRST, _ADDED = (12, 16, 8), 4
-# Of many starts, this many are left after each addition, and none that costs so many times the best; all are given up
-# whose misses are, from a second swing on, so many times the noise.
+# Of many starts, this many are left after each addition, and none that costs so many times the
+# best; all are given up whose misses are, from a second swing on, so many times the noise.
 _LEFT, _WORSE, _LOST = (8, 5, 4, 3, 2, 2, 1), 30.0, 5.0
-# What was added is a wrong minimum if each of its angles costs more than this many times the noise's variance.
+# What was added is a wrong minimum if each of its angles costs more than this many times the
+# noise's variance.
 _POOR = 3.0
 _WIDE_OPEN = (1.0, 0.3, 0.03)
 # The windows farther behind are left alone: what comes next depends on the last swings.
 _LOOKED_BACK = 64
 
 
-def _predicted(problem: Problem, start: _Start, point: Point, upto: int, settings: Settings) -> Point:
-    """The point with nodes up to `upto`: what is known of them from the data, the rest from the motion so far."""
+def _predicted(
+    problem: Problem, start: _Start, point: Point, upto: int, settings: Settings
+) -> Point:
+    """The point with nodes up to `upto`: what is known of them from the data, the rest from the
+    motion so far.
+    """
     nodes = list(point.nodes.T)
     for k in range(len(nodes), upto):
         here = problem._replace(dts=problem.dts[:, k - 1 : k])
@@ -83,11 +101,15 @@ def _predicted(problem: Problem, start: _Start, point: Point, upto: int, setting
 
 
 def _candidates(problem: Problem, start: _Start, settings: Settings, windows: int) -> list[Point]:
-    """First nodes: the known one, or those of a grid for a hidden rod that do better than their neighbours."""
+    """First nodes: the known one, or those of a grid for a hidden rod that do better than their
+    neighbours.
+    """
     fields = np.zeros(problem.by_free.shape[1])
     if np.all(start.known[:, 0]):
         return [Point(start.nodes[:, :1], fields)]
-    grid = np.meshgrid(np.arange(_ANGLES) * (2 * np.pi / _ANGLES), settings.rate * _VELOCITIES, indexing="ij")
+    grid = np.meshgrid(
+        np.arange(_ANGLES) * (2 * np.pi / _ANGLES), settings.rate * _VELOCITIES, indexing="ij"
+    )
     nodes = np.repeat(start.nodes[:, :1], grid[0].size, axis=1)
     hidden = int(np.argmin(start.known[:, 0]))
     nodes[hidden], nodes[2 + hidden] = grid[0].ravel(), grid[1].ravel()
@@ -99,15 +121,23 @@ def _candidates(problem: Problem, start: _Start, settings: Settings, windows: in
         missed = wrapped(np.moveaxis(angles, 1, 0) - problem.measured[..., k : k + 1])
         cost += np.sum(np.where(problem.seen[..., k : k + 1], missed**2, 0.0), axis=(0, 1))
     table = np.pad(
-        np.pad(cost.reshape(grid[0].shape), ((1, 1), (0, 0)), "wrap"), ((0, 0), (1, 1)), constant_values=np.inf
+        np.pad(cost.reshape(grid[0].shape), ((1, 1), (0, 0)), "wrap"),
+        ((0, 0), (1, 1)),
+        constant_values=np.inf,
     )
-    lowest = np.min(np.lib.stride_tricks.sliding_window_view(table, (3, 3)), axis=(2, 3)).ravel() >= cost
+    lowest = (
+        np.min(np.lib.stride_tricks.sliding_window_view(table, (3, 3)), axis=(2, 3)).ravel() >= cost
+    )
     order = np.argsort(np.where(lowest, cost, np.inf))[: min(_STARTS, max(int(np.sum(lowest)), 1))]
     return [Point(first[:, i : i + 1], fields) for i in order]
 
 
-def window_by_window(problem: Problem, start: _Start, settings: Settings, first: int) -> tuple[Point, int]:
-    """Each node where the motion fitted so far leads, from `first` windows on: for rods and times without data."""
+def window_by_window(
+    problem: Problem, start: _Start, settings: Settings, first: int
+) -> tuple[Point, int]:
+    """Each node where the motion fitted so far leads, from `first` windows on: for rods and times
+    without data.
+    """
     points, total, upto, left = _candidates(problem, start, settings, first), 0, 0, list(_LEFT)
     while upto < problem.times.size:
         upto = min(upto + (_ADDED if upto else first), problem.times.size)
@@ -116,10 +146,17 @@ def window_by_window(problem: Problem, start: _Start, settings: Settings, first:
             cost, after, count = _extended(problem, start, point, upto, settings, len(points) == 1)
             total += count
             found.append((cost, after))
-            if upto == first and cost < _POOR * settings.noise**2 * problem.part(0, upto).observations:
+            if (
+                upto == first
+                and cost < _POOR * settings.noise**2 * problem.part(0, upto).observations
+            ):
                 break  # wrong ones cost ten times as much
         found.sort(key=lambda pair: pair[0])
-        points = [point for cost, point in found[: left.pop(0) if left else 1] if cost <= _WORSE * found[0][0]]
+        points = [
+            point
+            for cost, point in found[: left.pop(0) if left else 1]
+            if cost <= _WORSE * found[0][0]
+        ]
         seen = problem.part(max(0, upto - _LOOKED_BACK), upto).observations
         if not left and not found[0][0] < (_LOST * settings.noise) ** 2 * max(seen, 1):
             return _predicted(problem, start, found[0][1], problem.times.size, settings), total
@@ -134,14 +171,19 @@ def _extended(
 ) -> tuple[float, Point, int]:
     """The cost of the last windows up to `upto`, and the point with their nodes fitted.
 
-    What was added may have gone to a wrong minimum. Then, unless there are other starts, one window at a time does
-    better where a rod is hidden, and joints opened wide where the motion has come out of a gap in the data.
+    What was added may have gone to a wrong minimum. Then, unless there are other starts, one window
+    at a time does better where a rod is hidden, and joints opened wide where the motion has come
+    out of a gap in the data.
     """
     before = point.nodes.shape[1]
     if before == 1 or not alone:
         return _fitted_up_to(problem, start, point, upto, PRICES[before > 1 : 2], settings)
     total, best = 0, (math.inf, math.inf, point)
-    for sizes, prices in (((upto,), PRICES[1:2]), (range(before + 1, upto + 1), PRICES[1:2]), ((upto,), _WIDE_OPEN)):
+    for sizes, prices in (
+        ((upto,), PRICES[1:2]),
+        (range(before + 1, upto + 1), PRICES[1:2]),
+        ((upto,), _WIDE_OPEN),
+    ):
         trial = point
         for size in sizes:
             cost, trial, count = _fitted_up_to(problem, start, trial, size, prices, settings)
@@ -154,7 +196,12 @@ def _extended(
 
 
 def _fitted_up_to(
-    problem: Problem, start: _Start, point: Point, upto: int, prices: tuple[float, ...], settings: Settings
+    problem: Problem,
+    start: _Start,
+    point: Point,
+    upto: int,
+    prices: tuple[float, ...],
+    settings: Settings,
 ) -> tuple[float, Point, int]:
     point = _predicted(problem, start, point, upto, settings)
     behind = max(0, upto - _LOOKED_BACK)

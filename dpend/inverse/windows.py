@@ -1,18 +1,21 @@
-"""Windows: a motion cut into short pieces that pass through measured angles and meet at their joints.
+"""Windows: a motion cut into short pieces that pass through measured angles and meet at their
+joints.
 
-Each window is integrated from its own initial state, the node; all run side by side with their derivatives. What is
-minimised over nodes and parameters is
+Each window is integrated from its own initial state, the node; all run side by side with their
+derivatives. What is minimised over nodes and parameters is
 
     sum of (theta_model - theta_measured)^2 over all measured angles, modulo full turns,
 
-subject to every window ending where the next begins (multiple shooting). While the joints are open, a miss costs its
-square over a price; where they are closed, the price is zero. Either way the linear problem of an iteration couples
-neighbours only: a band of width 15, bordered by at most three columns for the parameters, is factorised once, which
-costs as much for each second of the data. Nothing is condensed onto the first node, so that the growth of the motion
-over its whole length, e^46 for a chaotic 20 s, never appears.
+subject to every window ending where the next begins (multiple shooting). While the joints are open,
+a miss costs its square over a price; where they are closed, the price is zero. Either way the
+linear problem of an iteration couples neighbours only: a band of width 15, bordered by at most
+three columns for the parameters, is factorised once, which costs as much for each second of the
+data. Nothing is condensed onto the first node, so that the growth of the motion over its whole
+length, e^46 for a chaotic 20 s, never appears.
 
-Inside, l1 = m1 = 1 and a pendulum is the logarithms of l2/l1, m2/m1 and g/l1, which so keep their signs; the unknowns
-are those of the free fields over their start, and the nodes (theta1, theta2, omega1, omega2).
+Inside, l1 = m1 = 1 and a pendulum is the logarithms of l2/l1, m2/m1 and g/l1, which so keep their
+signs; the unknowns are those of the free fields over their start, and the nodes (theta1, theta2,
+omega1, omega2).
 """
 
 import math
@@ -30,22 +33,29 @@ from dpend.mechanics.pendulum import Pendulum, State, fastest, momenta, velociti
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import moved, step_size
 
-# Order 8 in (theta, p) with its stages as a loop, which compiles in seconds together with its derivatives. Only its
-# method is used.
+# Order 8 in (theta, p) with its stages as a loop, which compiles in seconds together with its
+# derivatives. Only its method is used.
 _METHOD = Scheme("rk8", 1.0, written_out=False)
-# Windows side by side in one call; at 128 the slopes of a step outgrow the cache and it takes ten times as long.
+# Windows side by side in one call; at 128 the slopes of a step outgrow the cache and it takes ten
+# times as long.
 _LANES = 64
-# The length of a window in units of 1/(the slow mode's frequency): the rods of a chaotic motion, which turn several
-# times as fast, advance by less than a radian or two, and the cubics' velocities lead to its end.
+# The length of a window in units of 1/(the slow mode's frequency): the rods of a chaotic motion,
+# which turn several times as fast, advance by less than a radian or two, and the cubics' velocities
+# lead to its end.
 _WINDOW = 0.375
 # Intervals in a window, the fewest of these that its samples need: one compiled program each.
 _INTERVALS = (4, 16, 64, 256)
-# The fastest motion may advance by this in one integration step [rad], before and in the last iterations.
+# The fastest motion may advance by this in one integration step [rad], before and in the last
+# iterations.
 _ROUGH, _FINE = 0.6, 0.25
 
 
-def _window(gravity: Scalar, logs: Array, nodes: Array, dts: Array, steps: Scalar) -> tuple[Array, Array]:
-    """Angles after each interval, shape (intervals, 2, lanes), and the end of each window, (4, lanes)."""
+def _window(
+    gravity: Scalar, logs: Array, nodes: Array, dts: Array, steps: Scalar
+) -> tuple[Array, Array]:
+    """Angles after each interval, shape (intervals, 2, lanes), and the end of each window, (4,
+    lanes).
+    """
     one = jnp.ones_like(nodes[0])
     pendulum = Pendulum(one, jnp.exp(logs[0]), one, jnp.exp(logs[1]), gravity * jnp.exp(logs[2]))
 
@@ -64,14 +74,18 @@ def ends_of(gravity, logs, nodes, dts, steps):  # type: ignore[no-untyped-def]
 
 @jax.jit
 def linearised(gravity, logs, nodes, dts, steps):  # type: ignore[no-untyped-def]
-    """The same with derivatives along the four components of the node and the three logarithms, in front."""
+    """The same with derivatives along the four components of the node and the three logarithms, in
+    front.
+    """
     lanes = nodes.shape[1]
     logs = jnp.broadcast_to(logs[:, None], (3, lanes))
 
     def along(direction: Array) -> Any:
         tangent = jnp.broadcast_to(direction[:, None], (7, lanes))
         return jax.jvp(
-            lambda nodes, logs: _window(gravity, logs, nodes, dts, steps), (nodes, logs), (tangent[:4], tangent[4:])
+            lambda nodes, logs: _window(gravity, logs, nodes, dts, steps),
+            (nodes, logs),
+            (tangent[:4], tangent[4:]),
         )
 
     return jax.vmap(along, out_axes=(None, 0))(jnp.eye(7))
@@ -82,7 +96,9 @@ class Problem(NamedTuple):
 
     gravity: float  # g/l1 at the start [1/s^2]
     logs: np.ndarray  # log of l2/l1 and m2/m1 at the start, and 0
-    by_free: np.ndarray  # derivative of the three logarithms with respect to those of the free fields
+    by_free: (
+        np.ndarray
+    )  # derivative of the three logarithms with respect to those of the free fields
     times: np.ndarray  # of the nodes
     dts: np.ndarray  # (intervals, K)
     sample: np.ndarray  # the sample at the end of each interval, -1 where there is none
@@ -111,7 +127,9 @@ class Problem(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Where an iteration is: the nodes, shape (4, K), and the logarithms of the free fields over their start."""
+    """Where an iteration is: the nodes, shape (4, K), and the logarithms of the free fields over
+    their start.
+    """
 
     nodes: np.ndarray
     fields: np.ndarray
@@ -125,12 +143,15 @@ def run(problem: Problem, point: Point, steps: int, compiled: Any) -> list[np.nd
         nodes, dts = (table[:, start : start + _LANES] for table in (point.nodes, problem.dts))
         lanes = nodes.shape[1]
         fill = ((0, 0), (0, _LANES - lanes))
-        found = compiled(problem.gravity, logs, np.pad(nodes, fill, "edge"), np.pad(dts, fill, "edge"), steps)
+        found = compiled(
+            problem.gravity, logs, np.pad(nodes, fill, "edge"), np.pad(dts, fill, "edge"), steps
+        )
         pieces.append([np.asarray(leaf)[..., :lanes] for leaf in jax.tree.leaves(found)])
     return [np.concatenate(piece, axis=-1) for piece in zip(*pieces, strict=True)]
 
 
-# A field that is a thousand million times its start is not what was measured; e^700 would be no double.
+# A field that is a thousand million times its start is not what was measured; e^700 would be no
+# double.
 FARTHEST = math.log(1e9)
 
 
@@ -141,7 +162,9 @@ class Settings(NamedTuple):
 
 
 def fitted_angles(problem: Problem, point: Point, steps: int, series: Angles) -> np.ndarray:
-    """The fitted angles at the samples, shape (2, m), in one piece: nodes may be full turns apart."""
+    """The fitted angles at the samples, shape (2, m), in one piece: nodes may be full turns
+    apart.
+    """
     angles, ends = run(problem, point, steps, ends_of)
     turns = np.round((ends[:2, :-1] - point.nodes[:2, 1:]) / (2 * np.pi))
     turns = np.hstack([np.zeros((2, 1)), np.cumsum(turns, axis=1)])
@@ -153,15 +176,20 @@ def fitted_angles(problem: Problem, point: Point, steps: int, series: Angles) ->
     return fitted
 
 
-def laid_out(series: Angles, pendulum: Pendulum, by_free: np.ndarray, held: np.ndarray, rate: float) -> Problem:
-    """The samples in windows; where they are farther apart than an interval is long, there are intervals without.
+def laid_out(
+    series: Angles, pendulum: Pendulum, by_free: np.ndarray, held: np.ndarray, rate: float
+) -> Problem:
+    """The samples in windows; where they are farther apart than an interval is long, there are
+    intervals without.
 
     Arguments:
         rate: what time is measured by [rad/s].
     """
     times, values = series
     window, spaces = _WINDOW / rate, np.diff(times)
-    intervals = next((n for n in _INTERVALS if n * np.median(spaces) >= 0.7 * window), _INTERVALS[-1])
+    intervals = next(
+        (n for n in _INTERVALS if n * np.median(spaces) >= 0.7 * window), _INTERVALS[-1]
+    )
     pieces = np.maximum(1, np.ceil(spaces * (intervals / window) - _NEARLY_FITS).astype(int))
     sample = np.full(np.sum(pieces), -1)
     sample[np.cumsum(pieces) - 1] = np.arange(1, times.size)
@@ -174,7 +202,9 @@ def laid_out(series: Angles, pendulum: Pendulum, by_free: np.ndarray, held: np.n
     seen = (sample >= 0) & there[:, np.maximum(sample, 0)]
     return Problem(
         gravity=float(pendulum.g / pendulum.l1),
-        logs=np.array([math.log(pendulum.l2 / pendulum.l1), math.log(pendulum.m2 / pendulum.m1), 0.0]),
+        logs=np.array(
+            [math.log(pendulum.l2 / pendulum.l1), math.log(pendulum.m2 / pendulum.m1), 0.0]
+        ),
         by_free=by_free,
         times=nodes,
         dts=np.pad(dts, fill).reshape(count, intervals).T,
@@ -192,11 +222,20 @@ _NEARLY_FITS = 0.3
 
 
 def settings_for(
-    problem: Problem, nodes: np.ndarray, known: np.ndarray, rate: float, noise: float, fields: np.ndarray
+    problem: Problem,
+    nodes: np.ndarray,
+    known: np.ndarray,
+    rate: float,
+    noise: float,
+    fields: np.ndarray,
 ) -> Settings:
-    """With integration steps for the fastest motion seen at the nodes; where they are unknown, for a fast one."""
+    """With integration steps for the fastest motion seen at the nodes; where they are unknown, for
+    a fast one.
+    """
     logs = problem.logs + problem.by_free @ fields
-    pendulum = Pendulum(1.0, math.exp(logs[0]), 1.0, math.exp(logs[1]), problem.gravity * math.exp(logs[2]))
+    pendulum = Pendulum(
+        1.0, math.exp(logs[0]), 1.0, math.exp(logs[1]), problem.gravity * math.exp(logs[2])
+    )
     blind = ~np.all(known, axis=0)
     nodes = np.where(blind, np.array([0.0, 0.5 * np.pi, 3 * rate, -3 * rate])[:, None], nodes)
     fast = float(np.max(np.asarray(fastest(pendulum, momenta(pendulum, *nodes)))))
@@ -208,6 +247,7 @@ def settings_for(
 
 # A motion that asks for more integration steps in an interval is not the one that was measured.
 _MOST_STEPS = 200
-# The fast mode at the start may advance by so much in an interval [rad], in fifty steps: the search for a hidden rod
-# then takes half a minute, and with all of the steps above it took four times as long and found nothing.
+# The fast mode at the start may advance by so much in an interval [rad], in fifty steps: the search
+# for a hidden rod then takes half a minute, and with all of the steps above it took four times as
+# long and found nothing.
 MOST_TURN = 50 * _FINE

@@ -14,18 +14,20 @@ from dpend.maps.lanes import WIDTH
 from dpend.mechanics.pendulum import Pendulum
 from dpend.methods.scheme import Scheme
 
-# A sweep is refused beyond so many steps of all cells, or beyond this share of them in one motion. A map of
-# 4096 x 4096 cells takes 1e10 steps for 10 s at the default tolerance; 1e12 take a day on two cores. The steps
-# of one motion follow one another on one core: a million take some five seconds.
+# A sweep is refused beyond so many steps of all cells, or beyond this share of them in one motion.
+# A map of 4096 x 4096 cells takes 1e10 steps for 10 s at the default tolerance; 1e12 take a day on
+# two cores. The steps of one motion follow one another on one core: a million take some five
+# seconds.
 MOST_SWEEP_STEPS, SHARE = 1e12, 1e-6
 # What a user may ask for at most: JAX counts a loop's turns in 64 bits.
 COUNTABLE = 1e15
-# Steps of methods with uneven steps, for each step that fits into the duration: the mean over the square of releases,
-# 0.9 to 1.9 for four pendulums.
+# Steps of methods with uneven steps, for each step that fits into the duration: the mean over the
+# square of releases, 0.9 to 1.9 for four pendulums.
 _UNEVEN = 1.4
 # A motion whose steps would be so much shorter than the scheme's is given up as NaN at once.
 _LOST = 1e5
-# Steps that a core takes in a second, at order 8 with a tangent, for a first guess at how long a sweep takes.
+# Steps that a core takes in a second, at order 8 with a tangent, for a first guess at how long a
+# sweep takes.
 _RATE = 5e6
 
 
@@ -35,8 +37,8 @@ class Cost:
 
     Attributes:
         cells: to be computed, not mirrored.
-        each: steps of one motion, both passes; the mean where steps are uneven, of which one motion may take five times
-            as many; None where nothing is known of the motion.
+        each: steps of one motion, both passes; the mean where steps are uneven, of which one motion
+            may take five times as many; None where nothing is known of the motion.
         bytes: of the values of all cells, before they are compressed.
     """
 
@@ -66,20 +68,27 @@ def motion_steps(task: Task) -> float | None:
     if not task.scheme.even:
         steps *= _UNEVEN
     momenta = any(key in task.grid.axes or task.grid.at.get(key) for key in ("p1", "p2"))
-    # A release from rest gets hardly faster than the fast mode; a motion under way may start with short steps.
+    # A release from rest gets hardly faster than the fast mode; a motion under way may start with
+    # short steps.
     return steps if task.scheme.even or not momenta else steps * _shortening(task)
 
 
 def _shortening(task: Task) -> float:
     """By how much the scheme's step is cut at the start of the fastest of some cells."""
-    ends = [array[np.linspace(0, array.size - 1, 8).astype(int)] for array in task.grid.axes.values()]
-    cells = {key: mesh.ravel() for key, mesh in zip(task.grid.axes, np.meshgrid(*ends), strict=True)}
+    ends = [
+        array[np.linspace(0, array.size - 1, 8).astype(int)] for array in task.grid.axes.values()
+    ]
+    cells = {
+        key: mesh.ravel() for key, mesh in zip(task.grid.axes, np.meshgrid(*ends), strict=True)
+    }
     shorter = np.asarray(_cut(task.scheme, *task.shared, cells))
     return float(np.max(shorter[shorter < _LOST], initial=1.0))
 
 
 @partial(jax.jit, static_argnums=0)
-def _cut(scheme: Scheme, pendulum: Pendulum, at: dict[str, Scalar], cells: dict[str, Scalar]) -> Scalar:
+def _cut(
+    scheme: Scheme, pendulum: Pendulum, at: dict[str, Scalar], cells: dict[str, Scalar]
+) -> Scalar:
     def one(cell: dict[str, Scalar]) -> Scalar:
         here, state = placed(pendulum, at, cell)
         spin = scheme.spin(scheme.constants(here), scheme.enter(here, state))

@@ -1,4 +1,6 @@
-"""A grid of states and pendulums, its tiles and coordinates, and the quantity that is computed in each cell."""
+"""A grid of states and pendulums, its tiles and coordinates, and the quantity that is computed in
+each cell.
+"""
 
 import hashlib
 import inspect
@@ -20,7 +22,8 @@ from dpend.status import Status
 # (pendulum, state, scheme) -> named scalars.
 Quantity = Callable[[Pendulum, State, Scheme], Mapping[str, Scalar]]
 
-# Cells along the side of a tile: 65536 cells make a file of some 500 kB for each value, and a second or so of work.
+# Cells along the side of a tile: 65536 cells make a file of some 500 kB for each value, and a
+# second or so of work.
 _TILE = 256
 _UNITS = {
     "l1": "m",
@@ -43,7 +46,9 @@ PENDULUM = tuple(field.name for field in fields(Pendulum))
 
 @dataclass(frozen=True)
 class Keyed:
-    """A quantity that equals any other of the same function and settings, so that compiled code is found again."""
+    """A quantity that equals any other of the same function and settings, so that compiled code is
+    found again.
+    """
 
     function: Quantity
     arguments: tuple[Any, ...]
@@ -52,7 +57,10 @@ class Keyed:
     @staticmethod
     def of(quantity: Quantity) -> "Keyed":
         if not callable(quantity):
-            raise ValueError(f"quantity must be a function, got {quantity!r}: give one of dpend.chaos, or your own")
+            raise ValueError(
+                f"quantity must be a function, got {quantity!r}: give one of dpend.chaos, or your "
+                f"own"
+            )
         if not isinstance(quantity, partial):
             return Keyed(quantity, (), ())
         keyed = Keyed(quantity.func, quantity.args, tuple(sorted(quantity.keywords.items())))
@@ -72,20 +80,30 @@ class Keyed:
         """Module, name, keywords and a hash of the source.
 
         Raises:
-            ValueError: with `strict`, a lambda or closure without a name, or settings that text cannot hold.
+            ValueError: with `strict`, a lambda or closure without a name, or settings that text
+                cannot hold.
         """
         inner = inspect.unwrap(self.function)
         own = getattr(inner, "__qualname__", type(inner).__qualname__)
         try:
             source = inspect.getsource(inner)
-        except (OSError, TypeError, SyntaxError, tokenize.TokenError):  # another file stands where it was written
+        except (
+            OSError,
+            TypeError,
+            SyntaxError,
+            tokenize.TokenError,
+        ):  # another file stands where it was written
             source = ""
         if strict and name is None:
             if "<" in own or getattr(inner, "__closure__", None):
-                raise ValueError(f"name must be given to store a lambda or a closure, got {own}: say what it computes")
+                raise ValueError(
+                    f"name must be given to store a lambda or a closure, got {own}: say what it "
+                    f"computes"
+                )
             if not inspect.isfunction(inner) or not source:  # two of them would look alike
                 raise ValueError(
-                    f"name must be given to store a quantity that is no function in a file, got {own}: say what it "
+                    f"name must be given to store a quantity that is no function in a file, got "
+                    f"{own}: say what it "
                     "computes"
                 )
         try:
@@ -93,7 +111,8 @@ class Keyed:
         except (TypeError, ValueError):
             if strict and name is None:
                 raise ValueError(
-                    f"name must be given to store a quantity with settings that are no plain numbers or text, "
+                    f"name must be given to store a quantity with settings that are no plain "
+                    f"numbers or text, "
                     f"got {dict(self.keywords)}: say what it computes"
                 ) from None
             settings = "see the name"
@@ -113,37 +132,56 @@ class Grid:
     at: dict[str, float]
 
     @staticmethod
-    def checked(pendulum: Pendulum | Any, axes: Mapping[str, Any] | Any, at: Mapping[str, float] | Any) -> "Grid":
-        if isinstance(pendulum, Pendulum) and any(np.ndim(leaf) for leaf in vars(pendulum).values()):
-            raise ValueError("pendulum must have numbers for fields, got arrays: name those that vary as axes")
+    def checked(
+        pendulum: Pendulum | Any, axes: Mapping[str, Any] | Any, at: Mapping[str, float] | Any
+    ) -> "Grid":
+        if isinstance(pendulum, Pendulum) and any(
+            np.ndim(leaf) for leaf in vars(pendulum).values()
+        ):
+            raise ValueError(
+                "pendulum must have numbers for fields, got arrays: name those that vary as axes"
+            )
         pendulum = known_pendulum(pendulum)
         for name, given in (("axes", axes), ("at", at)):
             if not isinstance(given, Mapping):
                 raise ValueError(
-                    f"{name} must be a dictionary by field, got {shown(given)}: give one like {{'p1': 0.1}}"
+                    f"{name} must be a dictionary by field, got {shown(given)}: give one like "
+                    f"{{'p1': 0.1}}"
                 )
         if not 1 <= len(axes) <= 2:
-            raise ValueError(f"axes must be one or two, got {len(axes)}: give one like {{'theta1': angles}}")
+            raise ValueError(
+                f"axes must be one or two, got {len(axes)}: give one like {{'theta1': angles}}"
+            )
         for key in [*axes, *at]:
             if key not in STATE + PENDULUM:
                 known = ", ".join(STATE + PENDULUM)
-                raise ValueError(f"axes and at must be fields of State or Pendulum, got {key!r}: give one of {known}")
+                raise ValueError(
+                    f"axes and at must be fields of State or Pendulum, got {key!r}: give one of "
+                    f"{known}"
+                )
         twice = [key for key in at if key in axes or key in PENDULUM]
         if twice:
-            raise ValueError(f"at must name fields of State that are no axis, got {twice[0]!r}: leave it out")
+            raise ValueError(
+                f"at must name fields of State that are no axis, got {twice[0]!r}: leave it out"
+            )
         values = {}
         for key, given in axes.items():
             array = numbers(f"axis {key}", given)
             if array.ndim != 1 or not array.size or not np.all(np.isfinite(array)):
                 raise ValueError(
-                    f"axis {key} must be a one-dimensional array of finite numbers, got {shown(given)}: "
+                    f"axis {key} must be a one-dimensional array of finite numbers, got "
+                    f"{shown(given)}: "
                     "give other values"
                 )
             if key in ("l1", "l2", "m1", "m2") and np.any(array <= 0):
-                raise ValueError(f"axis {key} must be positive, got {array.min():g}: leave that out")
+                raise ValueError(
+                    f"axis {key} must be positive, got {array.min():g}: leave that out"
+                )
             values[key] = array
         rest = {field: 0.0 for field in STATE if field not in values}
-        return Grid(pendulum, values, rest | {key: known_number(key, value) for key, value in at.items()})
+        return Grid(
+            pendulum, values, rest | {key: known_number(key, value) for key, value in at.items()}
+        )
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -151,16 +189,22 @@ class Grid:
 
     @property
     def symmetric(self) -> bool:
-        """Whether reflecting a cell's state gives another cell's: then that is the one at the other end of the axes."""
+        """Whether reflecting a cell's state gives another cell's: then that is the one at the other
+        end of the axes.
+        """
         moving = [array for key, array in self.axes.items() if key in STATE]
         still = all(value == 0.0 for value in self.at.values())
-        return bool(moving) and still and all(np.array_equal(array, -array[::-1]) for array in moving)
+        return (
+            bool(moving) and still and all(np.array_equal(array, -array[::-1]) for array in moving)
+        )
 
     def reflected(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
         """The block of mirror images of a block of cells."""
         return tuple(
             slice(size - part.stop, size - part.start) if key in STATE else part
-            for (key, size), part in zip(zip(self.axes, self.shape, strict=True), block, strict=True)
+            for (key, size), part in zip(
+                zip(self.axes, self.shape, strict=True), block, strict=True
+            )
         )
 
     def turned(self, values: np.ndarray) -> np.ndarray:
@@ -169,24 +213,35 @@ class Grid:
 
     def tiles(self) -> Iterator[tuple[slice, ...]]:
         tile = self.tile()
-        for corner in np.ndindex(*(-(-size // side) for size, side in zip(self.shape, tile, strict=True))):
+        for corner in np.ndindex(
+            *(-(-size // side) for size, side in zip(self.shape, tile, strict=True))
+        ):
             yield tuple(
                 slice(index * side, min((index + 1) * side, size))
                 for index, side, size in zip(corner, tile, self.shape, strict=True)
             )
 
     def tile(self) -> tuple[int, ...]:
-        """A tile's shape: of symmetric axes an even number fits, so that whole tiles are mirror images of others."""
+        """A tile's shape: of symmetric axes an even number fits, so that whole tiles are mirror
+        images of others.
+        """
         side = _TILE if len(self.axes) == 2 else _TILE**2
-        return tuple(min(side, max(1, -(-size // 2)) if self.symmetric else size) for size in self.shape)
+        return tuple(
+            min(side, max(1, -(-size // 2)) if self.symmetric else size) for size in self.shape
+        )
 
     def lanes(self, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
         """The axes' values of every cell of a block, flat."""
         parts = [array[part] for array, part in zip(self.axes.values(), block, strict=True)]
-        return {key: mesh.ravel() for key, mesh in zip(self.axes, np.meshgrid(*parts, indexing="ij"), strict=True)}
+        return {
+            key: mesh.ravel()
+            for key, mesh in zip(self.axes, np.meshgrid(*parts, indexing="ij"), strict=True)
+        }
 
 
-def placed(pendulum: Pendulum, at: Mapping[str, Scalar], cell: Mapping[str, Scalar]) -> tuple[Pendulum, State]:
+def placed(
+    pendulum: Pendulum, at: Mapping[str, Scalar], cell: Mapping[str, Scalar]
+) -> tuple[Pendulum, State]:
     pendulum = replace(pendulum, **{key: value for key, value in cell.items() if key in PENDULUM})
     return pendulum, State(**{key: cell.get(key, at.get(key)) for key in STATE})
 
@@ -199,14 +254,20 @@ class _Cell:
     scheme: Scheme
     twice: bool
 
-    def __call__(self, shared: tuple[Pendulum, dict[str, Scalar]], cell: dict[str, Scalar]) -> dict[str, Scalar]:
+    def __call__(
+        self, shared: tuple[Pendulum, dict[str, Scalar]], cell: dict[str, Scalar]
+    ) -> dict[str, Scalar]:
         pendulum, state = placed(*shared, cell)
         values = dict(self.quantity(pendulum, state, self.scheme))
         taken = values.get("steps", 0)
         if self.twice:
             finer = self.quantity(pendulum, state, replace(self.scheme, step=self.scheme.step / 2))
             taken = taken + finer.get("steps", 0)
-            for key in [key for key, value in values.items() if jax.numpy.issubdtype(value.dtype, np.floating)]:
+            for key in [
+                key
+                for key, value in values.items()
+                if jax.numpy.issubdtype(value.dtype, np.floating)
+            ]:
                 difference = jax.numpy.abs(values[key] - finer[key])
                 values[f"{key}_error"] = jax.numpy.where(values[key] == finer[key], 0.0, difference)
         return values | {TAKEN: jax.numpy.asarray(taken)}
@@ -219,7 +280,9 @@ TAKEN = "steps taken"
 @jax.jit
 def release_energy(pendulum: Pendulum, at: dict[str, Scalar], cell: dict[str, Scalar]) -> Scalar:
     shape = next(iter(cell.values())).shape
-    pendulum, state = placed(pendulum, {key: jax.numpy.full(shape, value) for key, value in at.items()}, cell)
+    pendulum, state = placed(
+        pendulum, {key: jax.numpy.full(shape, value) for key, value in at.items()}, cell
+    )
     return hamiltonian(pendulum, state) * jax.numpy.ones(shape)
 
 
@@ -251,7 +314,11 @@ class Task:
         return {
             "dpend_version": __version__,
             **self.quantity.identity(name, strict),
-            **{field: float(getattr(self.grid.pendulum, field)) for field in PENDULUM if field not in self.grid.axes},
+            **{
+                field: float(getattr(self.grid.pendulum, field))
+                for field in PENDULUM
+                if field not in self.grid.axes
+            },
             **{f"at_{key}": value for key, value in self.grid.at.items()},
             "method": self.scheme.name,
             "step": self.scheme.step,
@@ -271,7 +338,8 @@ def kinds_of(task: Task) -> dict[str, np.dtype]:
     for key, kind in kinds.items():
         if kind.shape != ():
             raise ValueError(
-                f"each value of a quantity must be a scalar, got shape {kind.shape} for {key}: return its components "
+                f"each value of a quantity must be a scalar, got shape {kind.shape} for {key}: "
+                f"return its components "
                 "under names of their own"
             )
     del kinds[TAKEN]
@@ -279,9 +347,12 @@ def kinds_of(task: Task) -> dict[str, np.dtype]:
     taken = [key for key in kinds if key in STATE + PENDULUM or key in coordinates_of(task.grid)]
     if taken:
         raise ValueError(
-            f"a quantity's value must not bear the name of a coordinate, got {taken[0]!r}: call it another"
+            f"a quantity's value must not bear the name of a coordinate, got {taken[0]!r}: call it "
+            f"another"
         )
-    return {key: np.dtype(kind.dtype) for key, kind in kinds.items()} | {"status": np.dtype(np.uint8)}
+    return {key: np.dtype(kind.dtype) for key, kind in kinds.items()} | {
+        "status": np.dtype(np.uint8)
+    }
 
 
 def coordinates_of(grid: Grid) -> dict[str, tuple[str, np.ndarray, dict[str, str]]]:
@@ -296,5 +367,8 @@ def coordinates_of(grid: Grid) -> dict[str, tuple[str, np.ndarray, dict[str, str
 def units_of(key: str) -> dict[str, Any]:
     unit = _UNITS.get(key.removesuffix("_error"))
     if key == "status":
-        return {"flag_values": [int(s) for s in Status], "flag_meanings": " ".join(s.name.lower() for s in Status)}
+        return {
+            "flag_values": [int(s) for s in Status],
+            "flag_meanings": " ".join(s.name.lower() for s in Status),
+        }
     return {"units": unit} if unit else {}

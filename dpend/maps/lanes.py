@@ -1,12 +1,14 @@
 """Many at once: a function of one state mapped over lanes, in blocks, on all CPU devices.
 
-Not for users: `sweep` and the scans of `atlas` call it. It is the one place that knows what makes many trajectories
-fast on a CPU, which is three things. Lanes go in blocks of a width at which XLA makes vector code of every operation
-and a block's whole state stays in the first-level cache; each block runs its time loop to the end before the next one
-starts; and the blocks are dealt to all CPU devices. On any other backend the same call is one `jax.vmap`.
+Not for users: `sweep` and the scans of `atlas` call it. It is the one place that knows what makes
+many trajectories fast on a CPU, which is three things. Lanes go in blocks of a width at which XLA
+makes vector code of every operation and a block's whole state stays in the first-level cache; each
+block runs its time loop to the end before the next one starts; and the blocks are dealt to all CPU
+devices. On any other backend the same call is one `jax.vmap`.
 
-A launch is a fixed number of blocks, of which only as many run as there are lanes for, so that one compiled program
-serves any number of lanes, and every lane's bits are the same whatever number of lanes, launches or devices there are.
+A launch is a fixed number of blocks, of which only as many run as there are lanes for, so that one
+compiled program serves any number of lanes, and every lane's bits are the same whatever number of
+lanes, launches or devices there are.
 """
 
 import math
@@ -25,18 +27,19 @@ from jax.tree_util import PyTreeDef
 
 from dpend.checks import Scalar
 
-# Lanes in a block, for every method, with and without a tangent. Measured in million steps/s on one core with AVX-512,
-# end states and (with one tangent): rk4-circle 45 (20) at 32 lanes, 125 (45) at 64, 110 (37) at 128; rk8-circle 14 (8),
-# 26 (11), 18 (4). At 32 LLVM unrolls the loops over lanes before it looks for vectors in them; at 128 order 8 outgrows
-# the cache.
+# Lanes in a block, for every method, with and without a tangent. Measured in million steps/s on one
+# core with AVX-512, end states and (with one tangent): rk4-circle 45 (20) at 32 lanes, 125 (45) at
+# 64, 110 (37) at 128; rk8-circle 14 (8), 26 (11), 18 (4). At 32 LLVM unrolls the loops over lanes
+# before it looks for vectors in them; at 128 order 8 outgrows the cache.
 WIDTH = 64
-# Blocks a device takes in one launch: enough that the millisecond of starting one is lost, also for short motions;
-# where each lane gives more than so many numbers, fewer.
+# Blocks a device takes in one launch: enough that the millisecond of starting one is lost, also for
+# short motions; where each lane gives more than so many numbers, fewer.
 _BLOCKS, _FEW_NUMBERS = 256, 64
-# Steps that a device takes in one launch, at most, where a motion's are known: some five seconds at order 8. Results
-# come, and an interruption is heard, between launches.
+# Steps that a device takes in one launch, at most, where a motion's are known: some five seconds at
+# order 8. Results come, and an interruption is heard, between launches.
 _LAUNCH_STEPS = 50_000_000
-# Launches under way at once: one runs, one waits, so that no device stands still while results are collected.
+# Launches under way at once: one runs, one waits, so that no device stands still while results are
+# collected.
 _UNDER_WAY = 2
 
 
@@ -44,8 +47,9 @@ def over_lanes(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> A
     """function(shared, one) for every lane `one` of `each`, in order.
 
     Arguments:
-        function: traceable, from pytrees of float64 scalars to a pytree of scalars or arrays (integers below 2^53). One
-            compiled program is kept for each function that equals none before.
+        function: traceable, from pytrees of float64 scalars to a pytree of scalars or arrays
+            (integers below 2^53). One compiled program is kept for each function that equals none
+            before.
         shared: a pytree of scalars, the same for all lanes.
         each: a pytree with leaves of shape (n,), n at least 1.
     Returns:
@@ -55,8 +59,12 @@ def over_lanes(function: Callable[[Any, Any], Any], shared: Any, each: Any) -> A
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *pieces)
 
 
-def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any, steps: float = 1.0) -> Iterator[Any]:
-    """The results of `over_lanes` piece by piece, as they come: smaller pieces where a lane takes many `steps`."""
+def launches(
+    function: Callable[[Any, Any], Any], shared: Any, each: Any, steps: float = 1.0
+) -> Iterator[Any]:
+    """The results of `over_lanes` piece by piece, as they come: smaller pieces where a lane takes
+    many `steps`.
+    """
     leaves, structure = jax.tree.flatten(each)
     table = np.stack([np.asarray(leaf, np.float64) for leaf in leaves])
     shared = jax.tree.map(partial(jnp.asarray, dtype=jnp.float64), shared)
@@ -81,7 +89,9 @@ def launches(function: Callable[[Any, Any], Any], shared: Any, each: Any, steps:
 
 
 def _dealt(piece: np.ndarray, mesh: Mesh, blocks: int) -> tuple[Any, Any]:
-    """The blocks, dealt to the devices like cards so that all get alike, and how many of its own each has to run."""
+    """The blocks, dealt to the devices like cards so that all get alike, and how many of its own
+    each has to run.
+    """
     devices = mesh.devices.size
     values, lanes = piece.shape
     filled = np.empty((values, devices * blocks * WIDTH))
@@ -95,7 +105,9 @@ def _dealt(piece: np.ndarray, mesh: Mesh, blocks: int) -> tuple[Any, Any]:
 def _gathered(rows: jax.Array, lanes: int, kinds: Any) -> Any:
     shards = sorted(rows.addressable_shards, key=lambda shard: shard.index[0].start)
     used = -(-lanes // (len(shards) * WIDTH))
-    hands = np.stack([np.asarray(shard.data)[0, :used] for shard in shards])  # devices, blocks, values, width
+    hands = np.stack(
+        [np.asarray(shard.data)[0, :used] for shard in shards]
+    )  # devices, blocks, values, width
     table = hands.transpose(2, 1, 0, 3)
     return _collected(table.reshape(table.shape[0], -1)[:, :lanes], kinds)
 
@@ -105,7 +117,8 @@ def _collected(table: np.ndarray, kinds: Any) -> Any:
     leaves, structure = jax.tree.flatten(kinds)
     parts = np.split(table, np.cumsum([math.prod(kind.shape) for kind in leaves])[:-1])
     shaped = [
-        part.reshape(*kind.shape, -1).astype(kind.dtype, copy=False) for part, kind in zip(parts, leaves, strict=True)
+        part.reshape(*kind.shape, -1).astype(kind.dtype, copy=False)
+        for part, kind in zip(parts, leaves, strict=True)
     ]
     return jax.tree.unflatten(structure, shaped)
 
@@ -123,11 +136,19 @@ def _kinds(function: Callable[[Any, Any], Any], shared: PyTreeDef, each: PyTreeD
     return jax.eval_shape(function, *trees)
 
 
-def _row_by_row(function: Callable[[Any, Any], Any], shared: Any, each: PyTreeDef, table: jax.Array) -> jax.Array:
-    """Values in rows, lanes in columns, in and out: XLA copies several arrays whole where it updates one in place."""
-    mapped = jax.vmap(function, in_axes=(None, 0), out_axes=-1)(shared, jax.tree.unflatten(each, list(table)))
+def _row_by_row(
+    function: Callable[[Any, Any], Any], shared: Any, each: PyTreeDef, table: jax.Array
+) -> jax.Array:
+    """Values in rows, lanes in columns, in and out: XLA copies several arrays whole where it
+    updates one in place.
+    """
+    mapped = jax.vmap(function, in_axes=(None, 0), out_axes=-1)(
+        shared, jax.tree.unflatten(each, list(table))
+    )
     lanes = table.shape[1]
-    return jnp.concatenate([leaf.astype(jnp.float64).reshape(-1, lanes) for leaf in jax.tree.leaves(mapped)])
+    return jnp.concatenate(
+        [leaf.astype(jnp.float64).reshape(-1, lanes) for leaf in jax.tree.leaves(mapped)]
+    )
 
 
 _vmapped = jax.jit(_row_by_row, static_argnums=(0, 2))
@@ -135,7 +156,12 @@ _vmapped = jax.jit(_row_by_row, static_argnums=(0, 2))
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _blocks(
-    function: Callable[[Any, Any], Any], each: PyTreeDef, mesh: Mesh, shared: Any, hands: jax.Array, counts: jax.Array
+    function: Callable[[Any, Any], Any],
+    each: PyTreeDef,
+    mesh: Mesh,
+    shared: Any,
+    hands: jax.Array,
+    counts: jax.Array,
 ) -> jax.Array:
     def on_one_device(shared: Any, hand: jax.Array, count: jax.Array) -> jax.Array:
         def block(index: Scalar, done: jax.Array) -> jax.Array:

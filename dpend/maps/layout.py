@@ -40,7 +40,9 @@ def store_of(work: Work, path: Path, attributes: dict[str, Any]) -> Store:
 
 
 def _lay(work: Work, attributes: dict[str, Any], memory: dict[str, Any]) -> dict[str, Any]:
-    """An empty store in `memory`; the arrays that are computed. Each chunk ends in a checksum for any reader."""
+    """An empty store in `memory`; the arrays that are computed. Each chunk ends in a checksum for
+    any reader.
+    """
     import zarr
     from zarr.codecs import Crc32cCodec, ZstdCodec
     from zarr.storage import MemoryStore
@@ -56,7 +58,9 @@ def _lay(work: Work, attributes: dict[str, Any], memory: dict[str, Any]) -> dict
             chunks=values.shape,
             dimension_names=[dim],
             attributes=units,
-            compressors=[Crc32cCodec()],  # not compressed: compressors of other versions may give other bytes
+            compressors=[
+                Crc32cCodec()
+            ],  # not compressed: compressors of other versions may give other bytes
         )
         array[...] = values
     return {
@@ -66,10 +70,13 @@ def _lay(work: Work, attributes: dict[str, Any], memory: dict[str, Any]) -> dict
             dtype=kind,
             chunks=grid.tile(),
             dimension_names=list(grid.axes),
-            fill_value=int(Status.NOT_COMPUTED) if key == "status" else (math.nan if kind.kind == "f" else 0),
+            fill_value=int(Status.NOT_COMPUTED)
+            if key == "status"
+            else (math.nan if kind.kind == "f" else 0),
             attributes=units_of(key),
             compressors=[ZstdCodec(level=0, checksum=False), Crc32cCodec()],
-            # Chunks of nothing but fill values must be there too: a tile's files tell that it is done.
+            # Chunks of nothing but fill values must be there too: a tile's files tell that it is
+            # done.
             config={"write_empty_chunks": True},
         )
         for key, kind in work.kinds.items()
@@ -77,12 +84,18 @@ def _lay(work: Work, attributes: dict[str, Any], memory: dict[str, Any]) -> dict
 
 
 def _consolidated(files: dict[str, bytes]) -> dict[str, bytes]:
-    """The files with the metadata of all arrays in the group's too, where xarray looks for it first."""
+    """The files with the metadata of all arrays in the group's too, where xarray looks for it
+    first.
+    """
     inside = {
         name.removesuffix("/zarr.json"): json.loads(text)
         for name, text in sorted(files.items())
         if name.endswith("/zarr.json")
     }
     group = json.loads(files["zarr.json"])
-    group["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": inside}
+    group["consolidated_metadata"] = {
+        "kind": "inline",
+        "must_understand": False,
+        "metadata": inside,
+    }
     return files | {"zarr.json": json.dumps(group, indent=2).encode()}

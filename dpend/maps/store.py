@@ -1,7 +1,8 @@
 """Maps in a Zarr store that can be resumed.
 
-A tile is computed as a whole, its values are written and synced to disk, and only then its status: whatever moment the
-process is killed at, the same call finishes the map with the bytes that an uninterrupted run would have given.
+A tile is computed as a whole, its values are written and synced to disk, and only then its status:
+whatever moment the process is killed at, the same call finishes the map with the bytes that an
+uninterrupted run would have given.
 """
 
 import contextlib
@@ -23,7 +24,8 @@ import numpy as np
 
 from dpend.checks import unwritable
 
-# Files of metadata have a few kilobytes; a quantity's settings may add to that. Larger ones are not read [bytes].
+# Files of metadata have a few kilobytes; a quantity's settings may add to that. Larger ones are not
+# read [bytes].
 _LARGEST_DOCUMENT = 1 << 24
 # Where the digests of tiles and the lock lie: inside an array, where Zarr's readers do not look.
 _DIGESTS, _LOCK = "status/sha256", "status/lock"
@@ -44,7 +46,8 @@ class Store:
         attributes: of the group: all that determines the values.
         documents: metadata, by file name.
         coordinates: chunks of coordinates, by file name.
-        arrays: the bytes of a chunk of every array that is computed, by name, in the order of writing.
+        arrays: the bytes of a chunk of every array that is computed, by name, in the order of
+            writing.
         tiles: the indexes of all tiles, in the order of computing.
         encode: the bytes of a chunk, from the name of its file, the cells and their values.
     """
@@ -58,7 +61,9 @@ class Store:
     encode: Callable[[str, tuple[slice, ...], np.ndarray], bytes]
 
     def create(self) -> None:
-        """An empty store, under a temporary name until it is whole; nothing where another process is faster."""
+        """An empty store, under a temporary name until it is whole; nothing where another process
+        is faster.
+        """
         draft = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}")
         try:
             draft.mkdir()
@@ -76,14 +81,16 @@ class Store:
         """Refuses a store of another sweep.
 
         Raises:
-            ValueError: it is none, or its attributes are others, or it holds what belongs to no sweep.
+            ValueError: it is none, or its attributes are others, or it holds what belongs to no
+                sweep.
             RuntimeError: another version of this package made it.
         """
         found = _attributes("store", self.path)
         ours = self.attributes["dpend_version"]
         if found["dpend_version"] != ours:
             raise RuntimeError(
-                f"store {self.path} was made by version {found['dpend_version']} of dpend, this is {ours}: "
+                f"store {self.path} was made by version {found['dpend_version']} of dpend, this is "
+                f"{ours}: "
                 "finish it with that version, or give another name"
             )
         wanted = self._wanted
@@ -95,7 +102,10 @@ class Store:
                 )
         for name in sorted(os.listdir(self.path)):
             if name not in self._members and not name.endswith(".partial"):
-                raise ValueError(f"store {self.path} holds {name}, which is no part of this sweep: move it elsewhere")
+                raise ValueError(
+                    f"store {self.path} holds {name}, which is no part of this sweep: move it "
+                    f"elsewhere"
+                )
 
     @property
     def _members(self) -> set[str]:
@@ -157,7 +167,9 @@ class Store:
         return problems
 
     def _line(self, name: str, text: bytes) -> bytes:
-        """A chunk's line in the digest of its tile: of its bytes, its place, and the sweep that it belongs to."""
+        """A chunk's line in the digest of its tile: of its bytes, its place, and the sweep that it
+        belongs to.
+        """
         digest = hashlib.sha256(f"{self._identity} {name} ".encode())
         digest.update(text)
         return f"{digest.hexdigest()} {name}".encode()
@@ -179,27 +191,38 @@ class Store:
         return "/".join([_DIGESTS, *map(str, tile)])
 
     def repair(self, findings: "Findings") -> None:
-        """Writes metadata and coordinates again, and removes what is there of tiles that are not done."""
+        """Writes metadata and coordinates again, and removes what is there of tiles that are not
+        done.
+        """
         try:
             for leftover in [*findings.leftovers, *self.path.rglob("*.partial")]:
                 _remove(leftover)  # of a process that was killed while it wrote
             for name in findings.stale:
                 _put(self.path, name, {**self.documents, **self.coordinates}[name])
             for tile in findings.todo:
-                for name in (self._digest_name(tile), *(self.chunk(key, tile) for key in reversed(list(self.arrays)))):
+                for name in (
+                    self._digest_name(tile),
+                    *(self.chunk(key, tile) for key in reversed(list(self.arrays))),
+                ):
                     _clear(self.path, name)
         except OSError as error:
             raise self._unwritable(error) from None
 
-    def write(self, tile: tuple[int, ...], block: tuple[slice, ...], values: Mapping[str, Any]) -> None:
-        """Writes a tile's values, the status after them, the digest last, each once the one before is on the disk."""
+    def write(
+        self, tile: tuple[int, ...], block: tuple[slice, ...], values: Mapping[str, Any]
+    ) -> None:
+        """Writes a tile's values, the status after them, the digest last, each once the one before
+        is on the disk.
+        """
         try:
             lines = [self._write_chunk(key, tile, block, values[key]) for key in self.arrays]
             _put(self.path, self._digest_name(tile), b"".join(line + b"\n" for line in lines))
         except OSError as error:
             raise self._unwritable(error) from None
 
-    def _write_chunk(self, key: str, tile: tuple[int, ...], block: tuple[slice, ...], values: np.ndarray) -> bytes:
+    def _write_chunk(
+        self, key: str, tile: tuple[int, ...], block: tuple[slice, ...], values: np.ndarray
+    ) -> bytes:
         """Writes an array's chunk; its line in the digest."""
         name = self.chunk(key, tile)
         text = self.encode(name, block, values)
@@ -220,7 +243,8 @@ class Store:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Keeps others from writing; the system lets go of it when the process ends, however it ends.
+        """Keeps others from writing; the system lets go of it when the process ends, however it
+        ends.
 
         Raises:
             ValueError: another one writes, or the store cannot be written to.
@@ -229,7 +253,8 @@ class Store:
 
         if not os.access(self.path, os.W_OK):
             raise ValueError(
-                f"store must be finished or one that can be written to, got {self.path}: finish a copy of it"
+                f"store must be finished or one that can be written to, got {self.path}: finish a "
+                f"copy of it"
             )
         try:
             file = self.path / _LOCK
@@ -247,7 +272,8 @@ class Store:
             if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
                 raise self._unwritable(error) from None
             raise ValueError(
-                f"store must not be written by two at once, got {self.path}, which another process or thread is "
+                f"store must not be written by two at once, got {self.path}, which another process "
+                f"or thread is "
                 "writing: wait for it, or give another name"
             ) from None
         try:
@@ -290,7 +316,8 @@ class Findings:
         more = len(self.damage) - len(named)
         rest = f", and {more} more" if more else ""
         return (
-            f"store {store.path} is damaged: {', '.join(named)}{rest}; what is damaged is made again, "
+            f"store {store.path} is damaged: {', '.join(named)}{rest}; what is damaged is made "
+            f"again, "
             f"{len(self.again)} of {len(store.tiles)} tiles"
         )
 
@@ -299,13 +326,15 @@ def check_store(name: str, path: Path) -> None:
     """Refuses, before anything is computed, a path where there is no store and none could be made.
 
     Raises:
-        ValueError: something else is there, or no directory to write in. `name` is the argument that is told.
+        ValueError: something else is there, or no directory to write in. `name` is the argument
+            that is told.
     """
     if os.path.lexists(path):
         _attributes(name, path)
     elif reason := unwritable(path):
         raise ValueError(
-            f"{name} must be a new name in a directory that can be written to, got {path} ({reason}): "
+            f"{name} must be a new name in a directory that can be written to, got {path} "
+            f"({reason}): "
             "give another place"
         )
 
@@ -320,7 +349,8 @@ def _attributes(name: str, path: Path) -> dict[str, Any]:
     found = document.get("attributes") if isinstance(document, dict) else None
     if not isinstance(found, dict) or not isinstance(found.get("dpend_version"), str):
         raise ValueError(
-            f"{name} must be a Zarr store of a sweep or a new name, got {path}: its zarr.json {problem}; "
+            f"{name} must be a Zarr store of a sweep or a new name, got {path}: its zarr.json "
+            f"{problem}; "
             "give another name"
         )
     return found

@@ -1,4 +1,6 @@
-"""A quantity over a grid, as a labelled dataset, in memory or streamed into a store that can be resumed."""
+"""A quantity over a grid, as a labelled dataset, in memory or streamed into a store that can be
+resumed.
+"""
 
 import math
 import os
@@ -44,37 +46,44 @@ def sweep(
 ) -> Any:
     """A quantity over one or two fields of `State` or `Pendulum`.
 
-    Reflection takes theta and p to -theta and -p, and the arithmetic follows it to the last bit. Where the grid is
-    symmetric and the values of a sample of cells are, to the last bit, those of their mirror images or their negatives,
-    one half of the cells is computed and the other mirrored.
+    Reflection takes theta and p to -theta and -p, and the arithmetic follows it to the last bit.
+    Where the grid is symmetric and the values of a sample of cells are, to the last bit, those of
+    their mirror images or their negatives, one half of the cells is computed and the other
+    mirrored.
 
     Arguments:
-        quantity: (pendulum, state, scheme) -> dict of scalars, traceable in the first two; settings by keyword, as
-            functools.partial(dpend.chaos.lyapunov, duration=10.0).
+        quantity: (pendulum, state, scheme) -> dict of scalars, traceable in the first two; settings
+            by keyword, as functools.partial(dpend.chaos.lyapunov, duration=10.0).
         pendulum: the parameters that are no axis.
-        axes: one or two fields of `State` [rad, kg m^2/s] or `Pendulum` [SI], each with its values, shape (n,); the
-            dataset's dimensions are in this order.
+        axes: one or two fields of `State` [rad, kg m^2/s] or `Pendulum` [SI], each with its values,
+            shape (n,); the dataset's dimensions are in this order.
         at: the other fields of the state; zero by default.
-        tolerance: wanted error [rad] of the angles; the method and step are those of `scheme_for`. 1e-6 by default.
+        tolerance: wanted error [rad] of the angles; the method and step are those of `scheme_for`.
+            1e-6 by default.
         method, step: both, instead of a tolerance.
-        error: "half-step" makes a second pass at half the step and adds |h - h/2| of each value as <name>_error.
+        error: "half-step" makes a second pass at half the step and adds |h - h/2| of each value as
+            <name>_error.
         mirror: False computes every cell, also of symmetric maps.
-        store: a directory for a Zarr store. One left unfinished by a run with the same settings is finished, one that
-            is damaged is mended, with a `StoreWarning` that says what was wrong; what is returned is opened lazily.
+        store: a directory for a Zarr store. One left unfinished by a run with the same settings is
+            finished, one that is damaged is mended, with a `StoreWarning` that says what was wrong;
+            what is returned is opened lazily.
         name: of the quantity in the store, needed where it is a lambda or a closure.
-        progress: called with cells done, cells in all, and steps taken by this call, after every piece of work.
+        progress: called with cells done, cells in all, and steps taken by this call, after every
+            piece of work.
         announce: called with the `Cost` of what is to be computed, before it is.
-        most_steps: refuse what would take more steps in all, or more than a millionth of it in one motion, because
-            these follow one another. The steps are known from the quantity's setting `duration`; of a quantity without
-            one the first cells tell.
+        most_steps: refuse what would take more steps in all, or more than a millionth of it in one
+            motion, because these follow one another. The steps are known from the quantity's
+            setting `duration`; of a quantity without one the first cells tell.
     Returns:
-        xarray.Dataset: the quantity's values, `status` (a value of `Status` for each cell: NONFINITE where a value is
-        NaN), coordinates with units, angles also in degrees, and as attributes all that determines the values.
+        xarray.Dataset: the quantity's values, `status` (a value of `Status` for each cell:
+        NONFINITE where a value is NaN), coordinates with units, angles also in degrees, and as
+        attributes all that determines the values.
     Raises:
-        ValueError: bad axes, tolerance or method; a store made with other settings, or a directory that is none; a
-            store that another process is writing, or that cannot be written; more than `most_steps`, or than the
-            memory holds.
-        RuntimeError: a store made by another version of this package; float64 is switched off in JAX.
+        ValueError: bad axes, tolerance or method; a store made with other settings, or a directory
+            that is none; a store that another process is writing, or that cannot be written; more
+            than `most_steps`, or than the memory holds.
+        RuntimeError: a store made by another version of this package; float64 is switched off in
+            JAX.
     """
     require_float64()
     example = "functools.partial(dpend.chaos.lyapunov, duration=10.0)"
@@ -103,18 +112,30 @@ def sweep(
 
 def _scheme(grid: Grid, tolerance: Any, method: Any, step: Any) -> Scheme:
     if method is None and step is None:
-        wanted = known_number("tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad")
-        ends = {key: (array.min(), array.max()) for key, array in grid.axes.items() if key in PENDULUM}
+        wanted = known_number(
+            "tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad"
+        )
+        ends = {
+            key: (array.min(), array.max()) for key, array in grid.axes.items() if key in PENDULUM
+        }
         corners = np.array(np.meshgrid(*ends.values())).reshape(len(ends), -1).T if ends else [()]
-        pendulums = [replace(grid.pendulum, **dict(zip(ends, map(float, corner), strict=True))) for corner in corners]
-        # Without gravity nothing sets a time: the others do, as they do where zero lies between the ends.
-        schemes = [scheme_for(one, wanted) for one in [one for one in pendulums if one.g] or pendulums]
+        pendulums = [
+            replace(grid.pendulum, **dict(zip(ends, map(float, corner), strict=True)))
+            for corner in corners
+        ]
+        # Without gravity nothing sets a time: the others do, as they do where zero lies between the
+        # ends.
+        schemes = [
+            scheme_for(one, wanted) for one in [one for one in pendulums if one.g] or pendulums
+        ]
         return min(schemes, key=lambda scheme: scheme.step)  # the fastest pendulum's
     if tolerance is not None:
         raise ValueError(f"tolerance excludes method and step, got {shown(tolerance)}: give either")
     if method is None or step is None:
         given, missing = ("step", "method") if method is None else ("method", "step")
-        raise ValueError(f"{missing} must be given with {given}, got {given} alone: or give a tolerance")
+        raise ValueError(
+            f"{missing} must be given with {given}, got {given} alone: or give a tolerance"
+        )
     return Scheme(method, step)
 
 
@@ -128,7 +149,12 @@ def compute(work: Work) -> dict[str, np.ndarray]:
     values["status"][...] = Status.NOT_COMPUTED
     parities = find_parities(work.task)
     for block in grid.tiles():
-        tile = whole_tile(work, block, parities, lambda image: {key: array[image] for key, array in values.items()})
+        tile = whole_tile(
+            work,
+            block,
+            parities,
+            lambda image: {key: array[image] for key, array in values.items()},
+        )
         for key, array in tile.items():
             values[key][block] = array
     return values
@@ -138,7 +164,8 @@ def _check_memory(size: int) -> None:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if size > memory:
         raise ValueError(
-            f"axes must leave values that the memory holds, got {size / 1e9:.3g} GB for {memory / 1e9:.3g} GB: give a "
+            f"axes must leave values that the memory holds, got {size / 1e9:.3g} GB for "
+            f"{memory / 1e9:.3g} GB: give a "
             "store, or fewer cells"
         )
 
@@ -183,5 +210,10 @@ def _fill(work: Work, store: Store, todo: dict[tuple[int, ...], tuple[slice, ...
     parities = find_parities(work.task) if todo else None
     arrays = {key: store.array(key) for key in work.kinds}
     for tile, block in todo.items():
-        values = whole_tile(work, block, parities, lambda image: {key: array[image] for key, array in arrays.items()})
+        values = whole_tile(
+            work,
+            block,
+            parities,
+            lambda image: {key: array[image] for key, array in arrays.items()},
+        )
         store.write(tile, block, values)

@@ -27,13 +27,17 @@ class Work:
         self.cells, self.steps, self.all = 0, 0, math.prod(task.grid.shape)
         self.cost = Cost(1, motion_steps(task), 0)
         self._check(most_steps)  # before the motion is traced: JAX cannot count so far
-        self.kinds = kinds_of(task)  # refuses a quantity that cannot be mapped before anything is computed
+        self.kinds = kinds_of(
+            task
+        )  # refuses a quantity that cannot be mapped before anything is computed
 
     def price(self, done: int) -> None:
         """Refuses what costs too much where so many cells are done."""
         mirrored = self.task.mirror and self.task.grid.symmetric
         cells = max(-(-self.all // 2) - done, 0) if mirrored else self.all - done
-        self.cost = Cost(cells, self.cost.each, self.all * sum(kind.itemsize for kind in self.kinds.values()))
+        self.cost = Cost(
+            cells, self.cost.each, self.all * sum(kind.itemsize for kind in self.kinds.values())
+        )
         self._check(self.most_steps * SHARE)
 
     def begin(self, done: int) -> None:
@@ -61,17 +65,20 @@ class Work:
         needed = 1.01 * max(cost.steps, each / SHARE)
         more = f", or most_steps={needed:.3g}" if needed <= COUNTABLE else ""
         raise ValueError(
-            f"duration and step must leave at most {most * SHARE:.3g} steps to one motion and {most:.3g} to all, got "
-            f"{told} {self.task.scheme.step:.3g} s, which make {each:.3g} and {max(cost.cells, 1) * each:.3g}: give a "
+            f"duration and step must leave at most {most * SHARE:.3g} steps to one motion and "
+            f"{most:.3g} to all, got "
+            f"{told} {self.task.scheme.step:.3g} s, which make {each:.3g} and "
+            f"{max(cost.cells, 1) * each:.3g}: give a "
             f"shorter duration, a larger step or fewer cells{more}"
         )
 
 
 def find_parities(task: Task) -> dict[str, int] | None:
-    """1 for values that a cell shares with its mirror image, -1 for its negative; None if any is neither.
+    """1 for values that a cell shares with its mirror image, -1 for its negative; None if any is
+    neither.
 
-    The reflection of a state follows the motion to the last bit, so a sample decides: values that do not keep the
-    symmetry differ in some cell.
+    The reflection of a state follows the motion to the last bit, so a sample decides: values that
+    do not keep the symmetry differ in some cell.
     """
     if not (task.mirror and task.grid.symmetric):
         return None
@@ -114,7 +121,10 @@ def _tile_values(
         size - 1 - place if key in STATE else place
         for key, size, place in zip(grid.axes, grid.shape, places, strict=True)
     ]
-    inside = np.all([(part.start <= im) & (im < part.stop) for part, im in zip(block, images, strict=True)], axis=0)
+    inside = np.all(
+        [(part.start <= im) & (im < part.stop) for part, im in zip(block, images, strict=True)],
+        axis=0,
+    )
     later = np.ravel_multi_index(places, grid.shape) > np.ravel_multi_index(images, grid.shape)
     own_image = fresh & inside & later  # of a pair of images within the tile one is computed
     values = _lane_values(work, block, fresh & ~own_image)
@@ -126,13 +136,18 @@ def _tile_values(
     return values
 
 
-def _lane_values(work: "Work", block: tuple[slice, ...], compute: np.ndarray) -> dict[str, np.ndarray]:
-    """The values and status of the cells of a block that are to be computed, arrays of the block's shape."""
+def _lane_values(
+    work: "Work", block: tuple[slice, ...], compute: np.ndarray
+) -> dict[str, np.ndarray]:
+    """The values and status of the cells of a block that are to be computed, arrays of the block's
+    shape.
+    """
     task = work.task
     every = task.grid.lanes(block)
     chosen = np.flatnonzero(compute)
     if not task.scheme.even:
-        # A block of lanes takes as long as its slowest: cells of like energy take like numbers of steps.
+        # A block of lanes takes as long as its slowest: cells of like energy take like numbers of
+        # steps.
         energy = np.asarray(release_energy(task.grid.pendulum, task.grid.at, every))
         chosen = chosen[np.argsort(energy[chosen], kind="stable")]
     values: dict[str, np.ndarray] = {}
@@ -140,18 +155,26 @@ def _lane_values(work: "Work", block: tuple[slice, ...], compute: np.ndarray) ->
     for piece in _pieces(work, {key: lanes[chosen] for key, lanes in every.items()}):
         taken = int(piece.pop(TAKEN).sum())
         own = piece.pop("status", None)
-        bad = np.any([np.isnan(array) for array in piece.values() if array.dtype.kind == "f"], axis=0)
-        piece["status"] = np.where(bad, Status.NONFINITE, Status.CONVERGED if own is None else own).astype(np.uint8)
+        bad = np.any(
+            [np.isnan(array) for array in piece.values() if array.dtype.kind == "f"], axis=0
+        )
+        piece["status"] = np.where(
+            bad, Status.NONFINITE, Status.CONVERGED if own is None else own
+        ).astype(np.uint8)
         count = piece["status"].size
         for key, array in piece.items():
-            values.setdefault(key, np.zeros(compute.shape, array.dtype)).ravel()[chosen[at : at + count]] = array
+            values.setdefault(key, np.zeros(compute.shape, array.dtype)).ravel()[
+                chosen[at : at + count]
+            ] = array
         at += count
         work.count(count, taken)
     return values or {key: np.zeros(compute.shape, kind) for key, kind in kinds_of(task).items()}
 
 
 def _pieces(work: "Work", lanes: dict[str, np.ndarray]) -> Iterator[dict[str, np.ndarray]]:
-    """The results of lanes as they come, of the first few soon: they tell how long the rest takes."""
+    """The results of lanes as they come, of the first few soon: they tell how long the rest
+    takes.
+    """
     task, first = work.task, WIDTH * jax.local_device_count()
     parts = [slice(None)] if work.steps else [slice(None, first), slice(first, None)]
     for part in parts:

@@ -1,13 +1,14 @@
 """The pendulum: two point masses on massless rods in a plane, without friction or drive.
 
-Angles are absolute, from the downward vertical, positive anticlockwise; p1 and p2 are the canonical momenta. With
-delta = theta1 - theta2 and mu = m2/m1 the Hamiltonian is (Yamaguchi, section 2)
+Angles are absolute, from the downward vertical, positive anticlockwise; p1 and p2 are the canonical
+momenta. With delta = theta1 - theta2 and mu = m2/m1 the Hamiltonian is (Yamaguchi, section 2)
 
-    H = [p1^2/(2 m1 l1^2) + p2^2 (1 + mu)/(2 m2 l2^2) - p1 p2 cos(delta)/(m1 l1 l2)] / (1 + mu sin^2 delta)
+    H = [p1^2/(2 m1 l1^2) + p2^2 (1 + mu)/(2 m2 l2^2) - p1 p2 cos(delta)/(m1 l1 l2)]
+        / (1 + mu sin^2 delta)
         - (m1 + m2) g l1 cos theta1 - m2 g l2 cos theta2.
 
-Every function takes leaves of any one shape, so grids of states and of pendulums need no `vmap`; what is no `Pendulum`
-or no `State` raises a ValueError. SI units throughout.
+Every function takes leaves of any one shape, so grids of states and of pendulums need no `vmap`;
+what is no `Pendulum` or no `State` raises a ValueError. SI units throughout.
 """
 
 from collections.abc import Iterable
@@ -19,7 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.checks import Scalar, coordinate, instance, known_number, known_value, number, one_shape, single
+from dpend.checks import (
+    Scalar,
+    coordinate,
+    instance,
+    known_number,
+    known_value,
+    number,
+    one_shape,
+    single,
+)
 from dpend.mechanics.trig import sincos
 
 Tree = TypeVar("Tree")
@@ -28,8 +38,9 @@ Tree = TypeVar("Tree")
 def _register(cls: type[Tree]) -> type[Tree]:
     """Make a dataclass whose constructor checks its numbers a JAX tree of its fields.
 
-    Libraries rebuild trees from leaves that are no numbers: masks, `None`, text, shapes, differences of lengths. So
-    unflattening fills the fields and never runs a check: any leaf passes. `register_dataclass` calls the constructor.
+    Libraries rebuild trees from leaves that are no numbers: masks, `None`, text, shapes,
+    differences of lengths. So unflattening fills the fields and never runs a check: any leaf
+    passes. `register_dataclass` calls the constructor.
     """
     names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
     keys = [jax.tree_util.GetAttrKey(name) for name in names]
@@ -55,15 +66,18 @@ def _register(cls: type[Tree]) -> type[Tree]:
 class Pendulum:
     """The parameters of a double pendulum; bob 1 hangs from the pivot, bob 2 from bob 1.
 
-    The defaults are those of Yamaguchi's paper. Whoever constructs one has its numbers checked and made float64, of
-    arrays the sign; tracers pass, and so does everything that libraries put into the tree by unflattening.
+    The defaults are those of Yamaguchi's paper. Whoever constructs one has its numbers checked and
+    made float64, of arrays the sign; tracers pass, and so does everything that libraries put into
+    the tree by unflattening.
 
     Attributes:
         l1, l2: lengths of the rods [m], positive.
         m1, m2: masses of the bobs [kg], positive.
-        g: acceleration of gravity [m/s^2], downwards; any finite number, but orbits and modes need g > 0.
+        g: acceleration of gravity [m/s^2], downwards; any finite number, but orbits and modes need
+            g > 0.
     Raises:
-        ValueError: a parameter is no finite number, or a length or mass not positive; arrays that do not broadcast.
+        ValueError: a parameter is no finite number, or a length or mass not positive; arrays that
+            do not broadcast.
         RuntimeError: float64 is switched off in JAX.
     """
 
@@ -76,7 +90,9 @@ class Pendulum:
     def __post_init__(self) -> None:
         require_float64()
         for name, unit in (("l1", "m"), ("l2", "m"), ("m1", "kg"), ("m2", "kg")):
-            object.__setattr__(self, name, number(name, getattr(self, name), positive=True, unit=unit))
+            object.__setattr__(
+                self, name, number(name, getattr(self, name), positive=True, unit=unit)
+            )
         object.__setattr__(self, "g", number("g", self.g, unit="m/s^2"))
         one_shape(**vars(self))
 
@@ -90,8 +106,8 @@ class State:
         theta1, theta2: absolute angles from the downward vertical [rad], never wrapped.
         p1, p2: canonical momenta [kg m^2/s].
     Raises:
-        ValueError: a coordinate is no finite number; arrays that do not broadcast. An array, also a single number that
-            JAX has computed, may hold NaN: a motion that was lost.
+        ValueError: a coordinate is no finite number; arrays that do not broadcast. An array, also a
+            single number that JAX has computed, may hold NaN: a motion that was lost.
     """
 
     theta1: Scalar
@@ -100,7 +116,12 @@ class State:
     p2: Scalar
 
     def __post_init__(self) -> None:
-        for name, unit in (("theta1", "rad"), ("theta2", "rad"), ("p1", "kg m^2/s"), ("p2", "kg m^2/s")):
+        for name, unit in (
+            ("theta1", "rad"),
+            ("theta2", "rad"),
+            ("p1", "kg m^2/s"),
+            ("p2", "kg m^2/s"),
+        ):
             object.__setattr__(self, name, coordinate(name, getattr(self, name), unit=unit))
         one_shape(**vars(self))
 
@@ -120,7 +141,9 @@ def check_state(state: Any, name: str = "state") -> None:
     Raises:
         ValueError: another class.
     """
-    instance(name, state, State, "dpend.released(theta1, theta2) or dpend.State(theta1, theta2, p1, p2)")
+    instance(
+        name, state, State, "dpend.released(theta1, theta2) or dpend.State(theta1, theta2, p1, p2)"
+    )
 
 
 def check_mechanics(pendulum: Any, state: Any) -> None:
@@ -155,7 +178,9 @@ def known_pendulum(pendulum: Any) -> Pendulum:
 
 
 class BobEnergies(NamedTuple):
-    """Energies of each bob [J], potential energies measured from that bob's place in the hanging equilibrium."""
+    """Energies of each bob [J], potential energies measured from that bob's place in the hanging
+    equilibrium.
+    """
 
     kinetic1: Scalar
     potential1: Scalar
@@ -179,7 +204,8 @@ class NormalMode:
 
     Attributes:
         frequency: angular frequency [rad/s].
-        ratio: theta2/theta1, positive in the slow (in-phase) and negative in the fast (anti-phase) mode.
+        ratio: theta2/theta1, positive in the slow (in-phase) and negative in the fast (anti-phase)
+            mode.
         period: 2 pi/frequency [s].
     """
 
@@ -196,8 +222,9 @@ class Equilibria:
     Attributes:
         state: the states, leaves of shape (4,).
         energy: H there [J], shape (4,).
-        exponents: of the linear flow [1/s], complex, shape (4, 2): each row lists the two that, taken with both signs,
-            make the four; real ones are rates of escape, imaginary ones frequencies.
+        exponents: of the linear flow [1/s], complex, shape (4, 2): each row lists the two that,
+            taken with both signs, make the four; real ones are rates of escape, imaginary ones
+            frequencies.
     """
 
     state: State
@@ -211,7 +238,10 @@ def released(theta1: Scalar, theta2: Scalar) -> State:
     Raises:
         ValueError: an angle is no finite number, as for `State`.
     """
-    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
+    theta1, theta2 = (
+        coordinate("theta1", theta1, unit="rad"),
+        coordinate("theta2", theta2, unit="rad"),
+    )
     at_rest = jnp.zeros(jnp.broadcast_shapes(jnp.shape(theta1), jnp.shape(theta2)))
     return State(theta1, theta2, at_rest, at_rest)
 
@@ -223,8 +253,12 @@ def _relative_angle(state: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     return sin1, sin2, sin1 * cos2 - cos1 * sin2, cos1 * cos2 + sin1 * sin2
 
 
-def _rates(pendulum: Pendulum, state: State, sin_delta: Scalar, cos_delta: Scalar) -> tuple[Scalar, Scalar]:
-    """The angular velocities M^-1 p, with the inertia matrix's determinant m2 l1^2 l2^2 (m1 + m2 sin^2 delta)."""
+def _rates(
+    pendulum: Pendulum, state: State, sin_delta: Scalar, cos_delta: Scalar
+) -> tuple[Scalar, Scalar]:
+    """The angular velocities M^-1 p, with the inertia matrix's determinant m2 l1^2 l2^2 (m1 + m2
+    sin^2 delta).
+    """
     inertia1 = (pendulum.m1 + pendulum.m2) * pendulum.l1 * pendulum.l1
     inertia2 = pendulum.m2 * pendulum.l2 * pendulum.l2
     coupling = pendulum.m2 * pendulum.l1 * pendulum.l2 * cos_delta
@@ -250,8 +284,9 @@ def hamiltonian(pendulum: Pendulum | Any, state: State | Any) -> Scalar:
 def vector_field(pendulum: Pendulum | Any, state: State | Any) -> State:
     """The time derivative of the state, Hamilton's equations of `hamiltonian`.
 
-    The force between the bobs is written with the velocities, m2 l1 l2 omega1 omega2 sin(delta), which is what the
-    derivative of the kinetic energy with respect to delta comes to: a third of the operations of the paper's form.
+    The force between the bobs is written with the velocities, m2 l1 l2 omega1 omega2 sin(delta),
+    which is what the derivative of the kinetic energy with respect to delta comes to: a third of
+    the operations of the paper's form.
 
     Returns:
         State whose leaves are theta1' , theta2' [rad/s], p1', p2' [N m].
@@ -272,15 +307,23 @@ def velocities(pendulum: Pendulum | Any, state: State | Any) -> tuple[Scalar, Sc
     return _rates(pendulum, state, sin_delta, cos_delta)
 
 
-def momenta(pendulum: Pendulum | Any, theta1: Scalar, theta2: Scalar, omega1: Scalar, omega2: Scalar) -> State:
+def momenta(
+    pendulum: Pendulum | Any, theta1: Scalar, theta2: Scalar, omega1: Scalar, omega2: Scalar
+) -> State:
     """The state with these angles [rad] and angular velocities [rad/s]: p = M(delta) omega.
 
     Raises:
         ValueError: an angle or a velocity is no finite number, as for `State`.
     """
     check_pendulum(pendulum)
-    theta1, theta2 = coordinate("theta1", theta1, unit="rad"), coordinate("theta2", theta2, unit="rad")
-    omega1, omega2 = coordinate("omega1", omega1, unit="rad/s"), coordinate("omega2", omega2, unit="rad/s")
+    theta1, theta2 = (
+        coordinate("theta1", theta1, unit="rad"),
+        coordinate("theta2", theta2, unit="rad"),
+    )
+    omega1, omega2 = (
+        coordinate("omega1", omega1, unit="rad/s"),
+        coordinate("omega2", omega2, unit="rad/s"),
+    )
     _, cos_delta = sincos(theta1 - theta2)
     coupling = pendulum.m2 * pendulum.l1 * pendulum.l2 * cos_delta
     p1 = (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * omega1 + coupling * omega2
@@ -291,7 +334,8 @@ def momenta(pendulum: Pendulum | Any, theta1: Scalar, theta2: Scalar, omega1: Sc
 def energies(pendulum: Pendulum | Any, state: State | Any) -> BobEnergies:
     """Kinetic and potential energy of each bob [J], the latter zero where that bob hangs at rest.
 
-    Their sum is H - H(hanging at rest). 1 - cos theta is computed as 2 sin^2(theta/2), exact for small angles too.
+    Their sum is H - H(hanging at rest). 1 - cos theta is computed as 2 sin^2(theta/2), exact for
+    small angles too.
     """
     check_mechanics(pendulum, state)
     omega1, omega2 = velocities(pendulum, state)
@@ -308,9 +352,11 @@ def energies(pendulum: Pendulum | Any, state: State | Any) -> BobEnergies:
 
 
 def energy_scale(pendulum: Pendulum, state: State) -> Scalar:
-    """What an energy error is measured against [J]: the weights' torques plus the kinetic energy of `state`.
+    """What an energy error is measured against [J]: the weights' torques plus the kinetic energy of
+    `state`.
 
-    Half the range of the potential energy for a pendulum that moves under gravity; the kinetic energy where g = 0.
+    Half the range of the potential energy for a pendulum that moves under gravity; the kinetic
+    energy where g = 0.
     """
     weights = (pendulum.m1 + pendulum.m2) * pendulum.l1 + pendulum.m2 * pendulum.l2
     kinetic = energies(pendulum, state)
@@ -329,8 +375,9 @@ def positions(pendulum: Pendulum | Any, state: State | Any) -> Positions:
 def normal_modes(pendulum: Pendulum | Any) -> tuple[NormalMode, NormalMode]:
     """The two small oscillations about the hanging state, slow (in-phase) first.
 
-    A mode swings like a simple pendulum of length L with (L - l1)(L - l2) = kappa l1 l2, kappa = m2/(m1 + m2), so
-    omega^2 = g/L and theta2/theta1 = l1/(L - l2). Both roots are written without cancellation, for any mass ratio.
+    A mode swings like a simple pendulum of length L with (L - l1)(L - l2) = kappa l1 l2, kappa =
+    m2/(m1 + m2), so omega^2 = g/L and theta2/theta1 = l1/(L - l2). Both roots are written without
+    cancellation, for any mass ratio.
 
     Raises:
         ValueError: g is a number that is not positive: nothing swings.
@@ -338,7 +385,9 @@ def normal_modes(pendulum: Pendulum | Any) -> tuple[NormalMode, NormalMode]:
     check_pendulum(pendulum)
     gravity = None if np.ndim(pendulum.g) else known_value(pendulum.g)
     if gravity is not None and not gravity > 0:
-        raise ValueError(f"g must be positive for normal modes, got {gravity}: nothing swings without gravity")
+        raise ValueError(
+            f"g must be positive for normal modes, got {gravity}: nothing swings without gravity"
+        )
     return _modes(pendulum, pendulum.g)
 
 
@@ -351,7 +400,10 @@ def _modes(pendulum: Pendulum, gravity: Scalar) -> tuple[NormalMode, NormalMode]
     # root + |difference| never cancels, and (root + difference)(root - difference) = 4 share l1 l2.
     larger = root + jnp.abs(difference)
     smaller = 4 * share * l1 * l2 / larger
-    plus, minus = jnp.where(difference > 0, larger, smaller), jnp.where(difference > 0, smaller, larger)
+    plus, minus = (
+        jnp.where(difference > 0, larger, smaller),
+        jnp.where(difference > 0, smaller, larger),
+    )
     long = 0.5 * (l1 + l2 + root)
     short = pendulum.m1 / (pendulum.m1 + pendulum.m2) * l1 * l2 / long
 
@@ -363,15 +415,18 @@ def _modes(pendulum: Pendulum, gravity: Scalar) -> tuple[NormalMode, NormalMode]
 
 
 def fast_frequency(pendulum: Pendulum) -> Scalar:
-    """The fast mode's angular frequency [rad/s] for |g|: where gravity pulls upwards, the fastest rate of escape."""
+    """The fast mode's angular frequency [rad/s] for |g|: where gravity pulls upwards, the fastest
+    rate of escape.
+    """
     return _modes(pendulum, jnp.abs(pendulum.g))[1].frequency
 
 
 def equilibria(pendulum: Pendulum | Any) -> Equilibria:
     """The four equilibria with the exponents of the linear flow about them.
 
-    About (s1, s2) = (cos theta1, cos theta2) = (+-1, +-1) a solution exp(lambda t) has lambda^2 = g/q with
-    (q + s1 l1)(q + s2 l2) s1 s2 = kappa l1 l2 s1 s2, kappa = m2/(m1 + m2); both q are real.
+    About (s1, s2) = (cos theta1, cos theta2) = (+-1, +-1) a solution exp(lambda t) has lambda^2 =
+    g/q with (q + s1 l1)(q + s2 l2) s1 s2 = kappa l1 l2 s1 s2, kappa = m2/(m1 + m2); both q are
+    real.
 
     Raises:
         ValueError: leaves that are arrays: `jax.vmap` maps over many.
@@ -391,14 +446,18 @@ def equilibria(pendulum: Pendulum | Any) -> Equilibria:
     exponents = jnp.sqrt((g / jnp.stack([far, near], axis=-1)).astype(jnp.complex128))
     energy = -(m1 + m2) * g * l1 * signs[0] - m2 * g * l2 * signs[1]
     zero = jnp.zeros(4)
-    return Equilibria(State(jnp.asarray(angles[0]), jnp.asarray(angles[1]), zero, zero), energy, exponents)
+    return Equilibria(
+        State(jnp.asarray(angles[0]), jnp.asarray(angles[1]), zero, zero), energy, exponents
+    )
 
 
 def fastest(pendulum: Pendulum, state: State) -> Scalar:
-    """The rate that decides the step [rad/s]: of the linear motion, of the rods, and of the inertia they share.
+    """The rate that decides the step [rad/s]: of the linear motion, of the rods, and of the inertia
+    they share.
 
-    The last is 1/(1 + mu sin^2 delta), which a heavy lower bob makes narrow: it changes when the angle delta between
-    the rods does by sqrt(sin^2 delta + 1/mu). Near no equilibrium do motions part faster than the linear share.
+    The last is 1/(1 + mu sin^2 delta), which a heavy lower bob makes narrow: it changes when the
+    angle delta between the rods does by sqrt(sin^2 delta + 1/mu). Near no equilibrium do motions
+    part faster than the linear share.
     """
     rates = vector_field(pendulum, state)
     mu = pendulum.m2 / pendulum.m1

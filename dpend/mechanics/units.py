@@ -1,4 +1,6 @@
-"""Natural units: l1 = m1 = g = 1, so that a pendulum is (l2/l1, m2/m1), and sizes of small displacements."""
+"""Natural units: l1 = m1 = g = 1, so that a pendulum is (l2/l1, m2/m1), and sizes of small
+displacements.
+"""
 
 from typing import Any, NamedTuple
 
@@ -9,7 +11,9 @@ from dpend.mechanics.pendulum import Pendulum, State, check_pendulum, fast_frequ
 
 
 class Norm(NamedTuple):
-    """The size of a tangent; momenta are measured in units of 1/per_unit [kg m^2/s]. See the module's page."""
+    """The size of a tangent; momenta are measured in units of 1/per_unit [kg m^2/s]. See the
+    module's page.
+    """
 
     per_unit1: Scalar
     per_unit2: Scalar
@@ -23,7 +27,10 @@ class Norm(NamedTuple):
         """The tangent with these components without dimension."""
         theta1, theta2, rate1, rate2 = components
         return State(
-            theta1 + 0.0 * self.per_unit1, theta2 + 0.0 * self.per_unit2, rate1 / self.per_unit1, rate2 / self.per_unit2
+            theta1 + 0.0 * self.per_unit1,
+            theta2 + 0.0 * self.per_unit2,
+            rate1 / self.per_unit1,
+            rate2 / self.per_unit2,
         )
 
 

@@ -1,8 +1,9 @@
 """The circle form of a step, without trigonometry.
 
-Sine and cosine of both angles are carried as state, s' = c omega and c' = -s omega, and the angles are two more sums
-that nothing depends on. No step computes a sine, which is half of the canonical form's work. It is another
-discretisation of the same equations: s^2 + c^2 = 1 holds to the method's error, no better.
+Sine and cosine of both angles are carried as state, s' = c omega and c' = -s omega, and the angles
+are two more sums that nothing depends on. No step computes a sine, which is half of the canonical
+form's work. It is another discretisation of the same equations: s^2 + c^2 = 1 holds to the method's
+error, no better.
 """
 
 from typing import NamedTuple
@@ -17,9 +18,9 @@ from dpend.mechanics.trig import sincos
 class _Circle(NamedTuple):
     """A state without trigonometry, in units that leave the field four constants.
 
-    sin1 and cos1 lie on a circle of radius sqrt(mu), mu = m2/m1, so that their products with sin2 and cos2 are
-    sqrt(mu) times the sine and cosine of delta = theta1 - theta2; rate1 = p1/(m1 l1^2) and
-    rate2 = p2/(sqrt(mu) m1 l1 l2) are momenta [1/s].
+    sin1 and cos1 lie on a circle of radius sqrt(mu), mu = m2/m1, so that their products with sin2
+    and cos2 are sqrt(mu) times the sine and cosine of delta = theta1 - theta2; rate1 = p1/(m1 l1^2)
+    and rate2 = p2/(sqrt(mu) m1 l1 l2) are momenta [1/s].
     """
 
     theta1: Scalar
@@ -47,12 +48,21 @@ def to_circle(pendulum: Pendulum, state: State) -> _Circle:
     sin2, cos2 = sincos(state.theta2)
     root = _root_mu(pendulum)
     unit1, unit2 = _rate_units(pendulum)
-    return _Circle(state.theta1, state.theta2, root * sin1, root * cos1, sin2, cos2, state.p1 / unit1, state.p2 / unit2)
+    return _Circle(
+        state.theta1,
+        state.theta2,
+        root * sin1,
+        root * cos1,
+        sin2,
+        cos2,
+        state.p1 / unit1,
+        state.p2 / unit2,
+    )
 
 
 class _Constants(NamedTuple):
-    """What a circle's slopes need of the pendulum and the step; the pendulum's share is computed once, outside the loop
-    over steps.
+    """What a circle's slopes need of the pendulum and the step; the pendulum's share is computed
+    once, outside the loop over steps.
     """
 
     step: Scalar  # dt [s]
@@ -65,11 +75,13 @@ class _Constants(NamedTuple):
     back: Scalar  # its inverse
     weight1: Scalar  # of gravity, times the step
     weight2: Scalar
-    rescaling: Scalar  # 0.85/omega_f^2, zero without gravity: nothing but the motion itself then sets a time
+    # 0.85/omega_f^2, zero without gravity: nothing but the motion itself then sets a time
+    rescaling: Scalar
 
 
-# The weight of q in u. With it and the power -5/8 of u an error of 6e-6 and of 8e-9 rad, on releases over the whole
-# square, takes the fewest steps: 10 % fewer than with a weight of 1 and the power -1/2.
+# The weight of q in u. With it and the power -5/8 of u an error of 6e-6 and of 8e-9 rad, on
+# releases over the whole square, takes the fewest steps: 10 % fewer than with a weight of 1 and the
+# power -1/2.
 _SPIN_WEIGHT = 0.85
 
 
@@ -130,13 +142,19 @@ def circle_increment(constants: _Constants, x: _Circle) -> _Circle:
     pull = turn1 * motion.sin_delta * motion.omega2
     rate1 = -(constants.back * pull) - constants.weight1 * x.sin1
     rate2 = pull - constants.weight2 * x.sin2
-    return _Circle(turn1, turn2, x.cos1 * turn1, -x.sin1 * turn1, x.cos2 * turn2, -x.sin2 * turn2, rate1, rate2)
+    return _Circle(
+        turn1, turn2, x.cos1 * turn1, -x.sin1 * turn1, x.cos2 * turn2, -x.sin2 * turn2, rate1, rate2
+    )
 
 
-def tangent_increment(constants: _Constants, pair: tuple[_Circle, Tangent]) -> tuple[_Circle, Tangent]:
-    """Increments of a circle and of a tangent of it: the variational equations in the angles, written out.
+def tangent_increment(
+    constants: _Constants, pair: tuple[_Circle, Tangent]
+) -> tuple[_Circle, Tangent]:
+    """Increments of a circle and of a tangent of it: the variational equations in the angles,
+    written out.
 
-    Four components where the circle has eight, and two thirds of the operations of `jax.jvp`, which tests hold it to.
+    Four components where the circle has eight, and two thirds of the operations of `jax.jvp`, which
+    tests hold it to.
     """
     x, d = pair
     sin_delta, cos_delta, inverse, omega1, omega2 = _motion(constants, x)
@@ -146,9 +164,12 @@ def tangent_increment(constants: _Constants, pair: tuple[_Circle, Tangent]) -> t
     step = constants.step * inverse
     turn1 = step * (d.rate1 - cos_delta * d.rate2 + shear * x.rate2 - deepening * omega1)
     turn2 = step * (
-        constants.ratio * (constants.mass_ratio * d.rate2 - cos_delta * d.rate1 + shear * x.rate1) - deepening * omega2
+        constants.ratio * (constants.mass_ratio * d.rate2 - cos_delta * d.rate1 + shear * x.rate1)
+        - deepening * omega2
     )
-    pull = sin_delta * (turn1 * omega2 + omega1 * turn2) + constants.step * (omega1 * omega2) * (cos_delta * between)
+    pull = sin_delta * (turn1 * omega2 + omega1 * turn2) + constants.step * (omega1 * omega2) * (
+        cos_delta * between
+    )
     rate1 = -(constants.back * pull) - constants.weight1 * (x.cos1 * d.angle1)
     rate2 = pull - constants.weight2 * (x.cos2 * d.angle2)
     return circle_increment(constants, x), Tangent(turn1, turn2, rate1, rate2)

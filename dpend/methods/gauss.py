@@ -1,9 +1,9 @@
 """The Gauss method of order 6: implicit, symplectic and symmetric, with compensated sums.
 
-The energy error does not grow with time, but for a part that vanishes exponentially with the step (the paper's orbit at
-40 degrees loses 2e-14 of its energy a period with 40 steps in it, 1e-17 with 60), and one of 2e-18 to 1e-17 a period
-whose cause is not known. Its point is a canonical state with the rounding errors of all sums so far, which the next sum
-takes back.
+The energy error does not grow with time, but for a part that vanishes exponentially with the step
+(the paper's orbit at 40 degrees loses 2e-14 of its energy a period with 40 steps in it, 1e-17 with
+60), and one of 2e-18 to 1e-17 a period whose cause is not known. Its point is a canonical state
+with the rounding errors of all sums so far, which the next sum takes back.
 """
 
 from functools import partial
@@ -18,25 +18,30 @@ from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, State, vector_field
 from dpend.methods.runge_kutta import GAUSS, ROOT15, displaced
 
-# a_ij/b_j. The method is symplectic where b_i a_ij + b_j a_ji = b_i b_j, that is where the shares of ij and of ji add
-# up to 1, and symmetric in time where those of ij and of (4 - i)(4 - j) do. These doubles do both to the last bit; a_ij
-# themselves are off by 1e-17, and so would the energy be, in one direction, period by period.
+# a_ij/b_j. The method is symplectic where b_i a_ij + b_j a_ji = b_i b_j, that is where the shares
+# of ij and of ji add up to 1, and symmetric in time where those of ij and of (4 - i)(4 - j) do.
+# These doubles do both to the last bit; a_ij themselves are off by 1e-17, and so would the energy
+# be, in one direction, period by period.
 _NEAR, _FAR = 0.5 + 0.15 * ROOT15, 0.5 + 0.12 * ROOT15
 _SHARES = ((0.5, 1.0 - _NEAR, 1.0 - _FAR), (_NEAR, 0.5, 1.0 - _NEAR), (_FAR, _NEAR, 0.5))
-# An iteration that has come this near [rad] and gets no nearer has met rounding; one that has not in so many rounds
-# finds no solution.
+# An iteration that has come this near [rad] and gets no nearer has met rounding; one that has not
+# in so many rounds finds no solution.
 _NEARLY, _MOST_ROUNDS = 1e-9, 100
 
 
 class Summed(NamedTuple):
-    """A state, and what rounding has taken from its sums: the two together are the motion (compensated summation)."""
+    """A state, and what rounding has taken from its sums: the two together are the motion
+    (compensated summation).
+    """
 
     state: State
     rest: State
 
 
 class _Round(NamedTuple):
-    """Slopes at all stages, the size of their last change and of the one before, and the number of rounds."""
+    """Slopes at all stages, the size of their last change and of the one before, and the number of
+    rounds.
+    """
 
     slopes: tuple[State, ...]
     size: Scalar
@@ -45,11 +50,13 @@ class _Round(NamedTuple):
 
 
 def _gauss_slopes(pendulum: Pendulum, dt: Scalar, state: State) -> tuple[State, ...]:
-    """The slopes at the stages of the step of `dt` [s], k_i = f(x + dt sum_j a_ij k_j), by fixed-point iteration.
+    """The slopes at the stages of the step of `dt` [s], k_i = f(x + dt sum_j a_ij k_j), by
+    fixed-point iteration.
 
-    Until the changes stop falling, which is the last bit: ended at a tolerance it would leave an error of one sign in
-    every step, and the energy would drift (Hairer, McLachlan and Razakarivony, Achieving Brouwer's law with implicit
-    Runge-Kutta methods, 2007). NaN where there is no solution, the step being too large.
+    Until the changes stop falling, which is the last bit: ended at a tolerance it would leave an
+    error of one sign in every step, and the energy would drift (Hairer, McLachlan and Razakarivony,
+    Achieving Brouwer's law with implicit Runge-Kutta methods, 2007). NaN where there is no
+    solution, the step being too large.
     """
     # Momenta as the rates of rods of that inertia, so that all changes are angles.
     length = jnp.abs(dt)  # steps may go backwards
@@ -64,10 +71,14 @@ def _gauss_slopes(pendulum: Pendulum, dt: Scalar, state: State) -> tuple[State, 
     def again(r: _Round) -> _Round:
         slopes = _at_stages(pendulum, dt, state, r.slopes)
         sizes = [size_of(old, new) for old, new in zip(r.slopes, slopes, strict=True)]
-        return _Round(slopes, jnp.maximum(sizes[0], jnp.maximum(sizes[1], sizes[2])), r.size, r.count + 1)
+        return _Round(
+            slopes, jnp.maximum(sizes[0], jnp.maximum(sizes[1], sizes[2])), r.size, r.count + 1
+        )
 
     def goes_on(r: _Round) -> Scalar:
-        return jnp.any((r.size > 0) & ((r.size < r.last) | (r.size > _NEARLY))) & (r.count < _MOST_ROUNDS)
+        return jnp.any((r.size > 0) & ((r.size < r.last) | (r.size > _NEARLY))) & (
+            r.count < _MOST_ROUNDS
+        )
 
     start = vector_field(pendulum, state)
     far = jnp.full_like(start.theta1, jnp.inf)
@@ -75,8 +86,13 @@ def _gauss_slopes(pendulum: Pendulum, dt: Scalar, state: State) -> tuple[State, 
     return jax.tree.map(lambda leaf: jnp.where(end.size <= _NEARLY, leaf, jnp.nan), end.slopes)
 
 
-def _at_stages(pendulum: Pendulum, dt: Scalar, state: State, slopes: tuple[State, ...]) -> tuple[State, ...]:
-    steps = [jax.tree.map(partial(jnp.multiply, dt * b), slope) for b, slope in zip(GAUSS.b, slopes, strict=True)]
+def _at_stages(
+    pendulum: Pendulum, dt: Scalar, state: State, slopes: tuple[State, ...]
+) -> tuple[State, ...]:
+    steps = [
+        jax.tree.map(partial(jnp.multiply, dt * b), slope)
+        for b, slope in zip(GAUSS.b, slopes, strict=True)
+    ]
     return tuple(vector_field(pendulum, displaced(state, row, steps)) for row in _SHARES)
 
 
@@ -92,7 +108,9 @@ def _gauss_leaves_jvp(primals, tangents):  # type: ignore[no-untyped-def]
     leaves = _gauss_leaves(*primals)
     flat, tree = ravel_pytree(leaves)
 
-    def again(leaves: list[Scalar], pendulum: list[Scalar], dt: Scalar, state: list[Scalar]) -> jax.Array:
+    def again(
+        leaves: list[Scalar], pendulum: list[Scalar], dt: Scalar, state: list[Scalar]
+    ) -> jax.Array:
         slopes = tuple(State(*leaves[i : i + 4]) for i in (0, 4, 8))
         return ravel_pytree(_at_stages(Pendulum(*pendulum), dt, State(*state), slopes))[0]
 
@@ -105,7 +123,10 @@ def gauss_step(constants: tuple[Pendulum, Scalar], point: Summed) -> Summed:
     pendulum, dt = constants
     leaves = _gauss_leaves(jax.tree.leaves(pendulum), dt, jax.tree.leaves(point.state))
     slopes = [State(*leaves[i : i + 4]) for i in (0, 4, 8)]
-    steps = [jax.tree.map(partial(jnp.multiply, dt * b), slope) for b, slope in zip(GAUSS.b, slopes, strict=True)]
+    steps = [
+        jax.tree.map(partial(jnp.multiply, dt * b), slope)
+        for b, slope in zip(GAUSS.b, slopes, strict=True)
+    ]
     change = displaced(point.rest, (1.0,) * 3, steps)
     state = jax.tree.map(jnp.add, point.state, change)
     rest = jax.tree.map(lambda old, new, change: (old - new) + change, point.state, state, change)

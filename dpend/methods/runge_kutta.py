@@ -1,4 +1,6 @@
-"""Explicit Runge-Kutta methods of order 4, 8 and 10: their tableaus, one step, and the canonical form of it."""
+"""Explicit Runge-Kutta methods of order 4, 8 and 10: their tableaus, one step, and the canonical
+form of it.
+"""
 
 import math
 from collections.abc import Callable
@@ -19,7 +21,9 @@ Point: TypeAlias = Any
 
 @dataclass(frozen=True)
 class Tableau:
-    """An explicit Runge-Kutta method: stage weights `a` (row i has i entries), step weights `b`, and its order."""
+    """An explicit Runge-Kutta method: stage weights `a` (row i has i entries), step weights `b`,
+    and its order.
+    """
 
     a: tuple[tuple[float, ...], ...]
     b: tuple[float, ...]
@@ -32,8 +36,8 @@ RK4 = Tableau(
     order=4,
 )
 
-# The 12-stage propagator of DOP853 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I), without its
-# error estimators; coefficients as in SciPy's dop853_coefficients.py.
+# The 12-stage propagator of DOP853 (Hairer, Norsett and Wanner, Solving Ordinary Differential
+# Equations I), without its error estimators; coefficients as in SciPy's dop853_coefficients.py.
 # fmt: off
 RK8 = Tableau(
     a=(
@@ -44,7 +48,8 @@ RK8 = Tableau(
         (0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792),
         (0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242),
         (0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125),
-        (0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328, -0.015319437748624402,
+        (0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328,
+         -0.015319437748624402,
          0.008273789163814023),
         (0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726, 27.59209969944671,
          20.154067550477894, -43.48988418106996),
@@ -52,17 +57,19 @@ RK8 = Tableau(
          15.279233632882423, -33.28821096898486, -0.020331201708508627),
         (-0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295, -8.149787010746927,
          -18.52006565999696, 22.739487099350505, 2.4936055526796523, -3.0467644718982196),
-        (2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188, 27.94888452941996,
+        (2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188,
+         27.94888452941996,
          -2.8589982771350235, -8.87285693353063, 12.360567175794303, 0.6433927460157636),
     ),
-    b=(0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003, -5.801203960010585,
+    b=(0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003,
+    -5.801203960010585,
          0.3111643669578199, -0.1521609496625161, 0.20136540080403034, 0.04471061572777259),
     order=8,
 )
 # fmt: on
 
-# The 15-stage method of order 10 of Stepanov, On Runge-Kutta methods of order 10, arXiv 2504.17329 (2025); coefficients
-# as in rklib's rks10.
+# The 15-stage method of order 10 of Stepanov, On Runge-Kutta methods of order 10, arXiv 2504.17329
+# (2025); coefficients as in rklib's rks10.
 # fmt: off
 RK10 = Tableau(
     a=(
@@ -72,36 +79,50 @@ RK10 = Tableau(
         (0.1, 0.0, 0.3),
         (0.13411078717201166, 0.0, 0.08746355685131195, 0.3498542274052478),
         (0.32865893899779125, 0.0, -0.8431230447116361, 1.2303830647211609, 0.0628218025289758),
-        (0.13018699084453347, 0.0, 0.0, 0.5807389729173741, -0.13206101704292822, 0.06375081152134318),
+        (0.13018699084453347, 0.0, 0.0, 0.5807389729173741, -0.13206101704292822,
+         0.06375081152134318),
         (0.11696914466403235, 0.0, 0.0, 0.804791321585223, -1.0324424073033935, 0.14123750757742515,
          0.8519720954414453),
-        (0.07230137681531805, 0.0, 0.0, 0.27844935379385793, -0.7203557425293995, 0.07147830972300757,
+        (0.07230137681531805, 0.0, 0.0, 0.27844935379385793, -0.7203557425293995,
+         0.07147830972300757,
          0.48054612710039024, -0.06494708686790669),
-        (-0.0336045800754256, 0.0, 0.0, -0.8576693886686749, 2.054105395119576, -0.20990904266184918,
+        (-0.0336045800754256, 0.0, 0.0, -0.8576693886686749, 2.054105395119576,
+         -0.20990904266184918,
          -1.3339722359516115, 0.18080634838458134, 0.31771584188867136),
-        (0.03781005386193373, 0.0, 0.0, 0.04559155864157964, 0.37485824729474737, -0.018981904165238088,
+        (0.03781005386193373, 0.0, 0.0, 0.04559155864157964, 0.37485824729474737,
+         -0.018981904165238088,
          -0.3360388626375594, 0.04220771637555915, 0.05190036098369083, 0.1600370714049642),
         (0.025378474265434523, 0.0, 0.0, 0.3623063275434741, -2.13002206625995, 0.1672715948594377,
-         1.5827509418646633, -0.20472018513908158, 0.3192653281448061, -0.19948525625469693, 0.43463908273559),
-        (0.02102955512349265, 0.0, 0.0, -0.20853138834469356, 0.32686349865476766, -0.04029159506346634,
-         -0.06216857011008511, 0.019401511635634607, 0.0336189343221497, 0.184057539066669, 0.12671904245006307,
+         1.5827509418646633, -0.20472018513908158, 0.3192653281448061, -0.19948525625469693,
+         0.43463908273559),
+        (0.02102955512349265, 0.0, 0.0, -0.20853138834469356, 0.32686349865476766,
+         -0.04029159506346634,
+         -0.06216857011008511, 0.019401511635634607, 0.0336189343221497, 0.184057539066669,
+         0.12671904245006307,
          0.2419172305057909),
-        (0.05901543960114423, 0.0, 0.0, 0.34675352940043946, -0.5435204392509414, 0.06699832051343939,
-         -0.2091059262738907, 0.03419681921537739, 0.656808691640117, -0.5300230864912716, 0.6823707136215755,
+        (0.05901543960114423, 0.0, 0.0, 0.34675352940043946, -0.5435204392509414,
+         0.06699832051343939,
+         -0.2091059262738907, 0.03419681921537739, 0.656808691640117, -0.5300230864912716,
+         0.6823707136215755,
          -0.5243167946491541, 0.8433503946378972),
-        (-0.04044086632866268, 0.0, 0.0, -0.9361744121603922, 1.4674109549590162, -0.18088384977898705,
-         1.1675891022744105, -0.28011360481035336, -1.8716683763485165, 2.2415881161250515, -1.5725720826914185,
+        (-0.04044086632866268, 0.0, 0.0, -0.9361744121603922, 1.4674109549590162,
+         -0.18088384977898705,
+         1.1675891022744105, -0.28011360481035336, -1.8716683763485165, 2.2415881161250515,
+         -1.5725720826914185,
          2.151700399601059, -1.8133404509027644, 0.6669050700615575),
     ),
-    b=(0.03333333333333333, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.13516962724923107, 0.054067850899692425,
-       0.21577825773602247, 0.06165093078172071, 0.2774291885177432, 0.1892374781489235, 0.03333333333333333),
+    b=(0.03333333333333333, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.13516962724923107,
+    0.054067850899692425,
+       0.21577825773602247, 0.06165093078172071, 0.2774291885177432, 0.1892374781489235,
+       0.03333333333333333),
     order=10,
 )
 # fmt: on
 
-# Up to this many stages are written out, the zeros of the tableau left out with them. Beyond it the stages run as a
-# loop unless a scheme says otherwise: order 8 written out takes XLA six times as long to compile and runs 1.5 times as
-# fast for one trajectory, but several times as fast for many at once.
+# Up to this many stages are written out, the zeros of the tableau left out with them. Beyond it the
+# stages run as a loop unless a scheme says otherwise: order 8 written out takes XLA six times as
+# long to compile and runs 1.5 times as fast for one trajectory, but several times as fast for many
+# at once.
 WRITTEN_OUT = 4
 
 
@@ -125,7 +146,8 @@ def explicit_step(
         for row in tableau.a:
             slopes.append(increment(displaced(point, row, slopes)))
         return displaced(base, tableau.b, slopes)
-    # Rows, one for each number that a leaf holds for each lane, so that a stage is one pass over contiguous lanes.
+    # Rows, one for each number that a leaf holds for each lane, so that a stage is one pass over
+    # contiguous lanes.
     leaves, structure = jax.tree.flatten(point)
     lanes = min((jnp.shape(leaf) for leaf in leaves), key=len)
     ends = np.cumsum([math.prod(jnp.shape(leaf)) // math.prod(lanes) for leaf in leaves])
@@ -135,18 +157,24 @@ def explicit_step(
 
     def tree(table: jax.Array) -> Point:
         parts = zip(leaves, jnp.split(table, ends[:-1]), strict=True)
-        return jax.tree.unflatten(structure, [jnp.reshape(part, jnp.shape(leaf)) for leaf, part in parts])
+        return jax.tree.unflatten(
+            structure, [jnp.reshape(part, jnp.shape(leaf)) for leaf, part in parts]
+        )
 
     start, stages = rows(point), len(tableau.b)
     weights = jnp.asarray(_square(tableau))
 
     def stage(index: Scalar, slopes: jax.Array) -> jax.Array:
-        row = lax.dynamic_index_in_dim(weights, index, keepdims=False)  # `.at` and [] would check the index
+        row = lax.dynamic_index_in_dim(
+            weights, index, keepdims=False
+        )  # `.at` and [] would check the index
         here = sum((row[j] * slopes[j] for j in range(stages - 1)), start=start)
         return lax.dynamic_update_index_in_dim(slopes, rows(increment(tree(here))), index, 0)
 
     slopes_table = lax.fori_loop(0, stages, stage, jnp.zeros((stages, *start.shape)))
-    return tree(sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=rows(base)))
+    return tree(
+        sum((b * slopes_table[j] for j, b in enumerate(tableau.b) if b != 0.0), start=rows(base))
+    )
 
 
 def displaced(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Point:
@@ -156,7 +184,9 @@ def displaced(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Poin
         return point
     weights = [weight for weight, _ in used]
     return jax.tree.map(
-        lambda x, *ks: sum((w * k for w, k in zip(weights, ks, strict=True)), start=x), point, *(k for _, k in used)
+        lambda x, *ks: sum((w * k for w, k in zip(weights, ks, strict=True)), start=x),
+        point,
+        *(k for _, k in used),
     )
 
 
@@ -170,8 +200,8 @@ def canonical_increment(constants: tuple[Pendulum, Scalar], state: State) -> Sta
     return jax.tree.map(lambda slope: dt * slope, vector_field(pendulum, state))
 
 
-# Collocation at the three Gauss-Legendre nodes (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I):
-# rows of `a` have as many entries as there are stages.
+# Collocation at the three Gauss-Legendre nodes (Hairer, Norsett and Wanner, Solving Ordinary
+# Differential Equations I): rows of `a` have as many entries as there are stages.
 ROOT15 = math.sqrt(15.0)
 GAUSS = Tableau(
     a=(

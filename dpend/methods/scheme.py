@@ -1,22 +1,26 @@
-"""One step of each integration method, and `Scheme`, the static pair of method and step that names a computation.
+"""One step of each integration method, and `Scheme`, the static pair of method and step that names
+a computation.
 
-A step is traceable in the pendulum, the point and the step itself; forward and reverse derivatives go through it. The
-point that a step moves is not always a `State`. There are two forms:
+A step is traceable in the pendulum, the point and the step itself; forward and reverse derivatives
+go through it. The point that a step moves is not always a `State`. There are two forms:
 
 - canonical: the `State` itself, (theta, p);
-- circle: sine and cosine of both angles are carried as state, s' = c omega and c' = -s omega, and the angles are two
-  more sums that nothing depends on. No step computes a sine, which is half of the canonical form's work. Another
-  discretisation of the same equations: s^2 + c^2 = 1 holds to the method's error, no better.
+- circle: sine and cosine of both angles are carried as state, s' = c omega and c' = -s omega, and
+  the angles are two more sums that nothing depends on. No step computes a sine, which is half of
+  the canonical form's work. Another discretisation of the same equations: s^2 + c^2 = 1 holds to
+  the method's error, no better.
 
-`gauss` is implicit, of order 6 and symplectic: the energy error does not grow with time, but for a part that vanishes
-exponentially with the step (the paper's orbit at 40 degrees loses 2e-14 of its energy a period with 40 steps in it,
-1e-17 with 60), and one of 2e-18 to 1e-17 a period whose cause is not known. Its point is a canonical state with the
-rounding errors of all sums so far, which the next sum takes back.
+`gauss` is implicit, of order 6 and symplectic: the energy error does not grow with time, but for a
+part that vanishes exponentially with the step (the paper's orbit at 40 degrees loses 2e-14 of its
+energy a period with 40 steps in it, 1e-17 with 60), and one of 2e-18 to 1e-17 a period whose cause
+is not known. Its point is a canonical state with the rounding errors of all sums so far, which the
+next sum takes back.
 
-The rescaled method takes equal steps in a time s of its own, dt/ds = u^(-5/8) with u = 1 + 0.85 q/omega_f^2,
-q = omega1^2 + omega2^2 + (omega1 - omega2)^2 and omega_f the fast normal mode's frequency: short in t where the rods
-fly. Each motion gets the steps that it needs, without a rejected one and without a branch. The step's length is fixed
-before it is taken, so that its stages cost what those of an even step cost.
+The rescaled method takes equal steps in a time s of its own, dt/ds = u^(-5/8) with u = 1 + 0.85
+q/omega_f^2, q = omega1^2 + omega2^2 + (omega1 - omega2)^2 and omega_f the fast normal mode's
+frequency: short in t where the rods fly. Each motion gets the steps that it needs, without a
+rejected one and without a branch. The step's length is fixed before it is taken, so that its stages
+cost what those of an even step cost.
 """
 
 import math
@@ -31,7 +35,14 @@ from jax import lax
 
 from dpend.checks import Scalar, flag, instance, known_number, one_of
 from dpend.mechanics.pendulum import Pendulum, State, fast_frequency, hamiltonian, known_pendulum
-from dpend.methods.circle import Tangent, circle_constants, circle_increment, spin_of, tangent_increment, to_circle
+from dpend.methods.circle import (
+    Tangent,
+    circle_constants,
+    circle_increment,
+    spin_of,
+    tangent_increment,
+    to_circle,
+)
 from dpend.methods.gauss import Summed, gauss_step
 from dpend.methods.runge_kutta import (
     GAUSS,
@@ -63,8 +74,9 @@ METHODS = {
     "rk10-circle-rescaled": _Method(RK10, True, even=False),
     "gauss": _Method(GAUSS, False, implicit=True),
 }
-# A release near the bottom swings slowly and evenly: it is given longer steps, in proportion to (energy above the
-# bottom)^-0.2, at most these times as long. Measured on releases over the whole square.
+# A release near the bottom swings slowly and evenly: it is given longer steps, in proportion to
+# (energy above the bottom)^-0.2, at most these times as long. Measured on releases over the whole
+# square.
 _PACE_POWER, _LONGEST_PACE = -0.2, 1.9
 
 
@@ -73,17 +85,21 @@ class Scheme:
     """A method and its step: static and hashable, so that compiled functions are keyed by it.
 
     Attributes:
-        name: `rk4` (the classical method of order 4) or `rk8` (the 12-stage order-8 propagator of DOP853), both in
-            (theta, p); `rk4-circle` and `rk8-circle`, the same without trigonometry; `rk8-circle-rescaled` and
-            `rk10-circle-rescaled` (15 stages, order 10, by Stepanov), in rescaled time; `gauss` (Gauss-Legendre, three
-            stages, order 6) in (theta, p), symplectic, for motions over very many periods: a step takes as long as two
-            of `rk8` written out.
-        step: the step [s]. Even methods take n = ceil(t/step) steps of t/n each over a motion of length t; the
-            rescaled one takes steps of at most `step`, near the bottom 1.9 `step`, much shorter where it flies.
-        written_out: whether all stages of a step are written out, or run as a loop: slower to compile, faster for many
-            lanes. By default the circle forms are, and order 8 in (theta, p) is not.
+        name: `rk4` (the classical method of order 4) or `rk8` (the 12-stage order-8 propagator of
+            DOP853), both in (theta, p); `rk4-circle` and `rk8-circle`, the same without
+            trigonometry; `rk8-circle-rescaled` and `rk10-circle-rescaled` (15 stages, order 10, by
+            Stepanov), in rescaled time; `gauss` (Gauss-Legendre, three stages, order 6) in (theta,
+            p), symplectic, for motions over very many periods: a step takes as long as two of `rk8`
+            written out.
+        step: the step [s]. Even methods take n = ceil(t/step) steps of t/n each over a motion of
+            length t; the rescaled one takes steps of at most `step`, near the bottom 1.9 `step`,
+            much shorter where it flies.
+        written_out: whether all stages of a step are written out, or run as a loop: slower to
+            compile, faster for many lanes. By default the circle forms are, and order 8 in (theta,
+            p) is not.
     Raises:
-        ValueError: an unknown name; a step that is not finite and positive, or traced; written_out not a boolean.
+        ValueError: an unknown name; a step that is not finite and positive, or traced; written_out
+            not a boolean.
     """
 
     name: str | Any
@@ -132,7 +148,9 @@ class Scheme:
             return cast(State, point.state)
         if not self._circle:
             return cast(State, point)
-        return State(point.theta1, point.theta2, constants.unit1 * point.rate1, constants.unit2 * point.rate2)
+        return State(
+            point.theta1, point.theta2, constants.unit1 * point.rate1, constants.unit2 * point.rate2
+        )
 
     def constants(self, pendulum: Pendulum, dt: Scalar = 1.0) -> Any:
         """What steps of `dt` [s] need, computed once; dt may be negative."""
@@ -152,13 +170,16 @@ class Scheme:
             return gauss_step(constants, point)
         increment = circle_increment if self._circle else canonical_increment
         tableau = METHODS[self.name].tableau
-        return explicit_step(tableau, partial(increment, constants), point, written_out=not self._rolled)
+        return explicit_step(
+            tableau, partial(increment, constants), point, written_out=not self._rolled
+        )
 
     def move_compensated(self, constants: Any, point: Point, rest: Point) -> tuple[Point, Point]:
         """The point one step later, the rounding errors of its sums kept (compensated summation).
 
         Arguments:
-            rest: what rounding has taken from the sums so far, zeros at the start; the same tree as the point.
+            rest: what rounding has taken from the sums so far, zeros at the start; the same tree as
+                the point.
         Returns:
             The point and the rest, which together are the motion.
         """
@@ -168,18 +189,20 @@ class Scheme:
         tableau = METHODS[self.name].tableau
         change = explicit_step(tableau, increment, point, written_out=not self._rolled, onto=rest)
         ahead = jax.tree.map(jnp.add, point, change)
-        return ahead, jax.tree.map(lambda old, new, change: (old - new) + change, point, ahead, change)
+        return ahead, jax.tree.map(
+            lambda old, new, change: (old - new) + change, point, ahead, change
+        )
 
     def move_tangents(self, constants: Any, point: Point, tangents: State) -> tuple[Point, State]:
         """One step of a point together with tangent vectors of it.
 
-        In (theta, p) the step itself is differentiated; the circle forms apply the method to the variational equations
-        along its own stages, which is the same but for the circle's drift, and leaves four components of six. Neither
-        changes the point.
+        In (theta, p) the step itself is differentiated; the circle forms apply the method to the
+        variational equations along its own stages, which is the same but for the circle's drift,
+        and leaves four components of six. Neither changes the point.
 
         Arguments:
-            tangents: (d theta1, d theta2, d p1, d p2) as a `State`: one vector, with leaves of the point's shape, or
-                as many as wanted along a new leading axis.
+            tangents: (d theta1, d theta2, d p1, d p2) as a `State`: one vector, with leaves of the
+                point's shape, or as many as wanted along a new leading axis.
         Returns:
             The point and the tangents.
         """
@@ -188,20 +211,33 @@ class Scheme:
         if not self._circle:
             one = partial(jax.jvp, partial(self.move, constants), (point,))
             many = jnp.ndim(tangents.theta1) > jnp.ndim(point.theta1)
-            return jax.vmap(lambda d: one((d,)), out_axes=(None, 0))(tangents) if many else one((tangents,))
+            return (
+                jax.vmap(lambda d: one((d,)), out_axes=(None, 0))(tangents)
+                if many
+                else one((tangents,))
+            )
         rates = constants.per_unit1 * tangents.p1, constants.per_unit2 * tangents.p2
         tangent = Tangent(tangents.theta1, tangents.theta2, *rates)
         increment = partial(tangent_increment, constants)
         tableau = METHODS[self.name].tableau
-        point, tangent = explicit_step(tableau, increment, (point, tangent), written_out=not self._rolled)
+        point, tangent = explicit_step(
+            tableau, increment, (point, tangent), written_out=not self._rolled
+        )
         return point, State(
-            tangent.angle1, tangent.angle2, constants.unit1 * tangent.rate1, constants.unit2 * tangent.rate2
+            tangent.angle1,
+            tangent.angle2,
+            constants.unit1 * tangent.rate1,
+            constants.unit2 * tangent.rate2,
         )
 
-    def _gauss_tangents(self, constants: Any, point: Summed, tangents: State) -> tuple[Summed, State]:
+    def _gauss_tangents(
+        self, constants: Any, point: Summed, tangents: State
+    ) -> tuple[Summed, State]:
         def one(tangent: State) -> tuple[Summed, State]:
             nothing = jax.tree.map(jnp.zeros_like, tangent)
-            moved, change = jax.jvp(partial(gauss_step, constants), (point,), (Summed(tangent, nothing),))
+            moved, change = jax.jvp(
+                partial(gauss_step, constants), (point,), (Summed(tangent, nothing),)
+            )
             return moved, jax.tree.map(jnp.add, change.state, change.rest)
 
         many = jnp.ndim(tangents.theta1) > jnp.ndim(point.state.theta1)
@@ -211,7 +247,9 @@ class Scheme:
         """The point one step of `dt` [s] later; `dt` may be negative."""
         return self.move(self.constants(pendulum, dt), point)
 
-    def advance_tangents(self, pendulum: Pendulum, point: Point, tangents: State, dt: Scalar) -> tuple[Point, State]:
+    def advance_tangents(
+        self, pendulum: Pendulum, point: Point, tangents: State, dt: Scalar
+    ) -> tuple[Point, State]:
         """The point and its tangents one step of `dt` [s] later."""
         return self.move_tangents(self.constants(pendulum, dt), point, tangents)
 
@@ -220,7 +258,9 @@ class Scheme:
         return lax.stop_gradient(spin_of(constants, point))
 
     def pace(self, pendulum: Pendulum, state: State) -> Scalar:
-        """The longest step of this motion in units of `step`: 1, but for rescaled time near the bottom."""
+        """The longest step of this motion in units of `step`: 1, but for rescaled time near the
+        bottom.
+        """
         bottom = (pendulum.m1 + pendulum.m2) * pendulum.l1 + pendulum.m2 * pendulum.l2
         height = 0.5 * (hamiltonian(pendulum, state) / (jnp.abs(pendulum.g) * bottom) + 1.0)
         height = jnp.where(jnp.isfinite(height), height, 1.0)  # no gravity, no bottom
@@ -228,22 +268,25 @@ class Scheme:
         return lax.stop_gradient(jnp.clip(height, longest, 1.0) ** _PACE_POWER)
 
     def steps(self, duration: float | Any) -> int:
-        """The number of even steps that a motion of `duration` [s] takes: ceil(|duration|/step - 1e-9).
+        """The number of even steps that a motion of `duration` [s] takes: ceil(|duration|/step -
+        1e-9).
 
         Raises:
-            ValueError: the step is longer than the motion, or so short that they would never end; the duration is no
-                known finite number.
+            ValueError: the step is longer than the motion, or so short that they would never end;
+                the duration is no known finite number.
         """
         duration = known_number("duration", duration, unit="s")
         count = abs(duration) / self.step
         if count > _MOST_STEPS:
             raise ValueError(
-                f"step must make at most {_MOST_STEPS:.0e} steps, got {self.step:g} s, which makes {count:.3g}: "
+                f"step must make at most {_MOST_STEPS:.0e} steps, got {self.step:g} s, which makes "
+                f"{count:.3g}: "
                 "give a larger step, or a shorter duration"
             )
         if 0.0 < count < 1.0 - 1e-9:
             raise ValueError(
-                f"step must not be longer than the motion of {abs(duration):g} s, got {self.step:g}: "
+                f"step must not be longer than the motion of {abs(duration):g} s, got "
+                f"{self.step:g}: "
                 "give a smaller step"
             )
         return math.ceil(count - 1e-9)
@@ -255,16 +298,19 @@ def check_scheme(scheme: Any) -> None:
     Raises:
         ValueError: another class, a method's name among them.
     """
-    instance("scheme", scheme, Scheme, 'dpend.Scheme("rk8", 1e-3) or dpend.scheme_for(pendulum, 1e-9)')
+    instance(
+        "scheme", scheme, Scheme, 'dpend.Scheme("rk8", 1e-3) or dpend.scheme_for(pendulum, 1e-9)'
+    )
 
 
 # A week of one motion at two million steps a second: what takes longer does not end.
 _MOST_STEPS = 1e12
 
 
-# The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th percentile over
-# 64 x 64 releases from rest on the whole square, after 2 s of the paper's pendulum, nearly two periods of its slow mode
-# (experiments/speed_vs_error.py). At no error was another method faster.
+# The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th
+# percentile over 64 x 64 releases from rest on the whole square, after 2 s of the paper's pendulum,
+# nearly two periods of its slow mode (experiments/speed_vs_error.py). At no error was another
+# method faster.
 _ERROR_OF_STEP = {
     "rk8-circle-rescaled": (
         (0.17, 1.3e-9),
@@ -293,11 +339,13 @@ _ERROR_OF_STEP = {
         (0.40, 1.2e-7),
     ),
 }
-# Below this error [rad] order 10 is the faster, by 1.2 at 3e-11; above it they are alike, and order 8 compiles sooner.
+# Below this error [rad] order 10 is the faster, by 1.2 at 3e-11; above it they are alike, and order
+# 8 compiles sooner.
 _ORDER_10_BELOW = 2e-8
 
-# How much shorter the step has to be for other pendulums than the paper's, whose masses are equal: against m2/m1, from
-# the error at one step on the same releases; and at lengths l2/l1 = 0.25 to 4 at most by (l2/l1)^0.15.
+# How much shorter the step has to be for other pendulums than the paper's, whose masses are equal:
+# against m2/m1, from the error at one step on the same releases; and at lengths l2/l1 = 0.25 to 4
+# at most by (l2/l1)^0.15.
 _SHORTER_FOR_MASSES = (
     (0.01, 0.60),
     (0.03, 0.68),
@@ -312,15 +360,18 @@ _SHORTER_FOR_MASSES = (
 
 
 def scheme_for(pendulum: Pendulum | Any, tolerance: float | Any) -> Scheme:
-    """The fastest scheme for many motions whose angles are to be right to `tolerance`, 99 in 100 of them.
+    """The fastest scheme for many motions whose angles are to be right to `tolerance`, 99 in 100 of
+    them.
 
-    "Right" is measured on releases from rest over the whole square of angles, after about two periods of the slow
-    mode, chaotic motions among them; `sweep(..., error="half-step")` tells cell by cell how it went.
+    "Right" is measured on releases from rest over the whole square of angles, after about two
+    periods of the slow mode, chaotic motions among them; `sweep(..., error="half-step")` tells cell
+    by cell how it went.
 
     Arguments:
         pendulum: its fields are numbers.
-        tolerance: of the larger angle [rad]; below 2e-11 the step is that of 2e-11, where rounding takes over, above
-            3e-2 that of 3e-2. Measured for mass ratios m2/m1 of 0.01 to 100 and lengths l2/l1 of 0.25 to 4.
+        tolerance: of the larger angle [rad]; below 2e-11 the step is that of 2e-11, where rounding
+            takes over, above 3e-2 that of 3e-2. Measured for mass ratios m2/m1 of 0.01 to 100 and
+            lengths l2/l1 of 0.25 to 4.
     Raises:
         ValueError: tolerance not positive; gravity zero, which sets no time; a traced argument.
     """
@@ -328,11 +379,15 @@ def scheme_for(pendulum: Pendulum | Any, tolerance: float | Any) -> Scheme:
     tolerance = known_number("tolerance", tolerance, positive=True, unit="rad")
     frequency = float(fast_frequency(pendulum))
     if not frequency > 0:
-        raise ValueError(f"g must not be zero for a tolerance, got {float(pendulum.g)}: give a method and a step")
+        raise ValueError(
+            f"g must not be zero for a tolerance, got {float(pendulum.g)}: give a method and a step"
+        )
     name = "rk10-circle-rescaled" if tolerance < _ORDER_10_BELOW else "rk8-circle-rescaled"
     turns, errors = zip(*_ERROR_OF_STEP[name], strict=True)
     turn = math.exp(np.interp(math.log(tolerance), np.log(errors), np.log(turns)))
     ratios, factors = zip(*_SHORTER_FOR_MASSES, strict=True)
-    turn *= math.exp(np.interp(math.log(pendulum.m2 / pendulum.m1), np.log(ratios), np.log(factors)))
+    turn *= math.exp(
+        np.interp(math.log(pendulum.m2 / pendulum.m1), np.log(ratios), np.log(factors))
+    )
     turn *= min(1.0, float(pendulum.l2 / pendulum.l1)) ** 0.15
     return Scheme(name, turn / frequency)

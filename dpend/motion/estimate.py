@@ -1,4 +1,6 @@
-"""How far a computed motion is from the true one: two passes compared, rounding and its growth included."""
+"""How far a computed motion is from the true one: two passes compared, rounding and its growth
+included.
+"""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -9,7 +11,14 @@ import numpy as np
 from jax import lax
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, State, energy_scale, fast_frequency, hamiltonian, vector_field
+from dpend.mechanics.pendulum import (
+    Pendulum,
+    State,
+    energy_scale,
+    fast_frequency,
+    hamiltonian,
+    vector_field,
+)
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import Turns, march, without_turns
 
@@ -32,22 +41,28 @@ class Comparison(NamedTuple):
 
 EPS = float(np.finfo(float).eps)
 
-# Tangents go along a motion of this method, the only one that carries them at little more than its own cost.
+# Tangents go along a motion of this method, the only one that carries them at little more than its
+# own cost.
 _GUIDE = "rk8-circle"
 # Estimates of so many roundings of the start may be of rounding alone.
 _SEEN = 64.0
-# So many passes, started such roundings apart, tell rounding errors within a factor of two (99 in 100, rods whose
-# lengths and masses differ by up to a thousand).
+# So many passes, started such roundings apart, tell rounding errors within a factor of two (99 in
+# 100, rods whose lengths and masses differ by up to a thousand).
 _PASSES = 4
-_AWAY = np.random.default_rng(1).choice([-1.0, 1.0], (_PASSES, 8)) * (np.arange(_PASSES) > 0)[:, None]
-# Errors of regular motions grow in proportion to time: at most by this much in 1/(fast mode's frequency).
+_AWAY = (
+    np.random.default_rng(1).choice([-1.0, 1.0], (_PASSES, 8)) * (np.arange(_PASSES) > 0)[:, None]
+)
+# Errors of regular motions grow in proportion to time: at most by this much in 1/(fast mode's
+# frequency).
 SHEAR = 10.0
 
 
 def compare_motions(pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-def]
-    """What second passes tell of a motion: one pass, or `_PASSES` of them where rounding may be what they see.
+    """What second passes tell of a motion: one pass, or `_PASSES` of them where rounding may be
+    what they see.
 
-    Two sums of rounding errors may end close to each other by chance, far from the truth both; as many will not.
+    Two sums of rounding errors may end close to each other by chance, far from the truth both; as
+    many will not.
     """
 
     def goes(carried):  # type: ignore[no-untyped-def]
@@ -69,11 +84,12 @@ def comparison_of(value: float) -> Comparison:
 
 
 def _one_comparison(pendulum, state, dt, steps, scheme, away):  # type: ignore[no-untyped-def]
-    """A motion beside one of half the step whose sums are compensated, and what its start's rounding grows to.
+    """A motion beside one of half the step whose sums are compensated, and what its start's
+    rounding grows to.
 
-    The two passes differ by the truncation error (Richardson's estimate) and by the rounding errors of the first, those
-    of the second being less. Rounding that both share, as that of the start, is seen by neither: hence the floor, from
-    two tangents along the first.
+    The two passes differ by the truncation error (Richardson's estimate) and by the rounding errors
+    of the first, those of the second being less. Rounding that both share, as that of the start, is
+    seen by neither: hence the floor, from two tangents along the first.
 
     Arguments:
         away: where the second pass starts, in roundings of each number of the point.
@@ -92,7 +108,9 @@ def _one_comparison(pendulum, state, dt, steps, scheme, away):  # type: ignore[n
         else:
             coarse, along = scheme.move(whole, coarse), guide.move_tangents(known, *along)
             tangents = along[1]
-        fine, rest = lax.fori_loop(0, 2, lambda i, pair: scheme.move_compensated(half, *pair), (fine, rest))
+        fine, rest = lax.fori_loop(
+            0, 2, lambda i, pair: scheme.move_compensated(half, *pair), (fine, rest)
+        )
         here = scheme.leave(whole, coarse)
         difference = angle_error(here, scheme.leave(half, fine))
         seen = (
@@ -119,7 +137,9 @@ def _one_comparison(pendulum, state, dt, steps, scheme, away):  # type: ignore[n
 
 
 def count_roundings(state: State) -> State:
-    """Two tangents, each an angle's size and its momentum's: times `EPS` the roundings of a start."""
+    """Two tangents, each an angle's size and its momentum's: times `EPS` the roundings of a
+    start.
+    """
     first, second = jnp.eye(2)
     sizes = jnp.maximum(1.0, jnp.abs(state.theta1)), jnp.maximum(1.0, jnp.abs(state.theta2))
     return State(sizes[0] * first, sizes[1] * second, state.p1 * first, state.p2 * second)
@@ -130,7 +150,11 @@ compare = jax.jit(compare_motions, static_argnames="scheme")
 
 def _last_place(turns: Turns) -> Scalar:
     """What an angle far from zero is rounded by when its turns are added [rad]."""
-    return 0.5 * float(np.finfo(float).eps) * jnp.maximum(jnp.abs(turns.theta1[0]), jnp.abs(turns.theta2[0]))
+    return (
+        0.5
+        * float(np.finfo(float).eps)
+        * jnp.maximum(jnp.abs(turns.theta1[0]), jnp.abs(turns.theta2[0]))
+    )
 
 
 def angle_error(a: State, b: State) -> Scalar:
@@ -150,8 +174,12 @@ def any_step(scheme: Scheme) -> Scheme:
 
 
 def growth_along(tangents: State | None) -> Scalar:
-    """What two tangents along the last axis grow to: of the larger angle, at the worst time; one with none."""
+    """What two tangents along the last axis grow to: of the larger angle, at the worst time; one
+    with none.
+    """
     if tangents is None:
         return jnp.asarray(1.0)
-    sizes = jnp.maximum(jnp.linalg.norm(tangents.theta1, axis=-1), jnp.linalg.norm(tangents.theta2, axis=-1))
+    sizes = jnp.maximum(
+        jnp.linalg.norm(tangents.theta1, axis=-1), jnp.linalg.norm(tangents.theta2, axis=-1)
+    )
     return jnp.max(sizes)

@@ -1,12 +1,14 @@
-"""Is this gradient right, and does it mean anything? Derivatives checked against differences; how far a motion's reach.
+"""Is this gradient right, and does it mean anything? Derivatives checked against differences; how
+far a motion's reach.
 
-`check_gradient` sets what JAX makes of a loss, forwards and in reverse, beside central finite differences extrapolated
-to step zero, which see nothing but the loss's values: for orbits, which are solved again for every difference, it is
-their implicit derivatives that are checked so.
+`check_gradient` sets what JAX makes of a loss, forwards and in reverse, beside central finite
+differences extrapolated to step zero, which see nothing but the loss's values: for orbits, which
+are solved again for every difference, it is their implicit derivatives that are checked so.
 
-Of a chaotic motion derivatives grow like the tangents, e^(lambda t), and the errors of the motion that they belong to
-grow with them. Differences see it first, since no step is both short enough for the motion to stay close by and long
-enough for rounding; then the derivatives themselves go, which `gradient_horizon` measures.
+Of a chaotic motion derivatives grow like the tangents, e^(lambda t), and the errors of the motion
+that they belong to grow with them. Differences see it first, since no step is both short enough for
+the motion to stay close by and long enough for rounding; then the derivatives themselves go, which
+`gradient_horizon` measures.
 """
 
 import math
@@ -29,8 +31,8 @@ from dpend.methods.scheme import Scheme, check_scheme
 from dpend.motion.integrate import march, step_size
 from dpend.status import Status
 
-# Steps of the differences, in units of the parameter: from where four extrapolations make a smooth loss exact to where
-# rounding is all there is.
+# Steps of the differences, in units of the parameter: from where four extrapolations make a smooth
+# loss exact to where rounding is all there is.
 _LARGEST_STEP, _RATIO, _LEVELS = 2.0**-5, 4.0, 15
 # A derivative below this share of the loss itself counts as zero.
 _NOTHING = 1e-7
@@ -46,10 +48,11 @@ class GradientHorizon:
 
     Attributes:
         time: from the start on [s], shape (n,).
-        growth: of tangents by then, root mean square over all directions, measured as on the page of `chaos`. The
-            derivative describes a change of the start [rad] only while that times the growth is well below 1.
-        error: of the derivatives, relative to them: the change on halving the step, and at least the growth of
-            rounding, growth times 2^-52; the largest so far.
+        growth: of tangents by then, root mean square over all directions, measured as on the page
+            of `chaos`. The derivative describes a change of the start [rad] only while that times
+            the growth is well below 1.
+        error: of the derivatives, relative to them: the change on halving the step, and at least
+            the growth of rounding, growth times 2^-52; the largest so far.
         horizon: the last of the times at which the error is within the tolerance [s].
         status: `BEYOND_HORIZON` if that is before the end.
     """
@@ -72,14 +75,15 @@ class GradientCheck:
         reverse: by `jax.vjp`; NaN if it was not asked for.
         difference: by central differences, extrapolated.
         difference_error: an estimate of their errors.
-        disagreement: of the worst derivative, forward or reverse, from the differences. Here derivatives are multiplied
-            by the size of their parameter (1 for zeros), and divided by the largest of them.
-        difference_noise: the worst of the differences' errors, divided by the largest of the differences: no better
-            agreement can be seen.
+        disagreement: of the worst derivative, forward or reverse, from the differences. Here
+            derivatives are multiplied by the size of their parameter (1 for zeros), and divided by
+            the largest of them.
+        difference_noise: the worst of the differences' errors, divided by the largest of the
+            differences: no better agreement can be seen.
         horizon: of the motion that was given, or None.
-        status: `CONVERGED` if they agree to the tolerance, `DISAGREEMENT` if they differ by more than that and ten
-            times the noise, `BEYOND_HORIZON` if the noise is above the tolerance or the motion outlasts its horizon,
-            `NONFINITE`.
+        status: `CONVERGED` if they agree to the tolerance, `DISAGREEMENT` if they differ by more
+            than that and ten times the noise, `BEYOND_HORIZON` if the noise is above the tolerance
+            or the motion outlasts its horizon, `NONFINITE`.
     """
 
     value: Scalar
@@ -100,9 +104,11 @@ class GradientCheck:
 
 _MESSAGES = {
     Status.CONVERGED: "The derivatives agree with the differences.",
-    Status.DISAGREEMENT: "The derivatives differ from the differences by more than the tolerance and the differences' "
+    Status.DISAGREEMENT: "The derivatives differ from the differences by more than the tolerance "
+    "and the differences' "
     "errors: they are wrong, or the loss is not smooth or chaotic here.",
-    Status.BEYOND_HORIZON: "The differences cannot tell to this tolerance, or the motion is longer than derivatives "
+    Status.BEYOND_HORIZON: "The differences cannot tell to this tolerance, or the motion is longer "
+    "than derivatives "
     "can be believed: shorten it, or raise the tolerance.",
     Status.NONFINITE: "A derivative is not finite.",
 }
@@ -118,49 +124,66 @@ def check_gradient(
 ) -> GradientCheck:
     """The derivatives of `loss` at `parameters`, forwards, in reverse, and by finite differences.
 
-    Each difference is (f(x + h) - f(x - h))/2h for 15 steps h from 1/32 of the parameter down to 1e-10 of it,
-    extrapolated by Romberg's scheme; of the whole table the entry is taken whose neighbours differ least, or
-    whose rounding is less. It costs 30 evaluations for each number among the parameters. A kink of which JAX takes the
-    mean slope is not seen.
+    Each difference is (f(x + h) - f(x - h))/2h for 15 steps h from 1/32 of the parameter down to
+    1e-10 of it, extrapolated by Romberg's scheme; of the whole table the entry is taken whose
+    neighbours differ least, or whose rounding is less. It costs 30 evaluations for each number
+    among the parameters. A kink of which JAX takes the mean slope is not seen.
 
     Arguments:
-        loss: of the parameters, a scalar. It is called as it is: hand over `jax.jit` of it if that can be.
-        parameters: a tree of numbers and arrays of them, such as `0.2`, a dictionary, a `Pendulum` or a `State`.
+        loss: of the parameters, a scalar. It is called as it is: hand over `jax.jit` of it if that
+            can be.
+        parameters: a tree of numbers and arrays of them, such as `0.2`, a dictionary, a `Pendulum`
+            or a `State`.
         tolerance: relative; 1e-6 leaves room for orbits, which are known to 1e-13.
-        reverse: False for a loss of which only forward derivatives exist, such as motions of a traced duration.
-        motion: (pendulum, state, duration, scheme) that the loss follows, for its `gradient_horizon`.
+        reverse: False for a loss of which only forward derivatives exist, such as motions of a
+            traced duration.
+        motion: (pendulum, state, duration, scheme) that the loss follows, for its
+            `gradient_horizon`.
     Returns:
         GradientCheck.
     Raises:
-        ValueError: a loss that is not a scalar; parameters that are not finite numbers; no parameters; tolerance not
-            positive; as `gradient_horizon`.
+        ValueError: a loss that is not a scalar; parameters that are not finite numbers; no
+            parameters; tolerance not positive; as `gradient_horizon`.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
     function("loss", loss, "the parameters", "lambda x: x**2")
-    tolerance, reverse = known_number("tolerance", tolerance, positive=True), flag("reverse", reverse)
+    tolerance, reverse = (
+        known_number("tolerance", tolerance, positive=True),
+        flag("reverse", reverse),
+    )
     point, tree = _flat(parameters)
     horizon = None if motion is None else gradient_horizon(*several("motion", motion, _MOTION, 4))
     value = jnp.asarray(loss(tree(point)))
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
-        raise ValueError(f"loss must give a real scalar, got {value.dtype} of shape {value.shape}: add it up")
+        raise ValueError(
+            f"loss must give a real scalar, got {value.dtype} of shape {value.shape}: add it up"
+        )
 
     def of(x: Scalar) -> Scalar:
         return jnp.asarray(loss(tree(x)), jnp.float64)
 
-    forward = np.array([jax.jvp(of, (point,), (direction,))[1] for direction in jnp.eye(point.size)])
+    forward = np.array(
+        [jax.jvp(of, (point,), (direction,))[1] for direction in jnp.eye(point.size)]
+    )
     backward = np.full(point.size, np.nan)
     if reverse:
         _, pull = jax.vjp(of, point)
         backward = np.asarray(pull(jnp.ones(()))[0])
     differences = np.array([_difference(of, np.asarray(point), i) for i in range(point.size)])
     size = np.where(np.asarray(point) == 0, 1.0, np.abs(point))
-    own = max(float(np.max(np.abs(differences[:, 0]) * size)), _NOTHING * abs(float(value)), np.finfo(float).tiny)
+    own = max(
+        float(np.max(np.abs(differences[:, 0]) * size)),
+        _NOTHING * abs(float(value)),
+        np.finfo(float).tiny,
+    )
     unit = max(float(np.max(np.abs(forward) * size)), own)
     analytic = [forward, backward] if reverse else [forward]
     apart = max(float(np.max(np.abs(one - differences[:, 0]) * size)) / unit for one in analytic)
     noise = float(np.max(differences[:, 1] * size)) / own
-    status = _verdict(apart, noise, tolerance, horizon, all(np.all(np.isfinite(one)) for one in analytic))
+    status = _verdict(
+        apart, noise, tolerance, horizon, all(np.all(np.isfinite(one)) for one in analytic)
+    )
     return GradientCheck(
         value=value,
         forward=tree(jnp.asarray(forward)),
@@ -174,7 +197,9 @@ def check_gradient(
     )
 
 
-def _verdict(apart: float, noise: float, tolerance: float, horizon: GradientHorizon | None, finite: bool) -> Status:
+def _verdict(
+    apart: float, noise: float, tolerance: float, horizon: GradientHorizon | None, finite: bool
+) -> Status:
     if not finite:
         return Status.NONFINITE
     if horizon is not None and horizon.status != Status.CONVERGED:
@@ -190,22 +215,33 @@ def _flat(parameters: Any) -> tuple[Any, Callable[[Any], Any]]:
         leaves = [numbers("parameters", leaf) for leaf in jax.tree.leaves(parameters)]
     except ValueError:
         raise ValueError(
-            f"parameters must be finite numbers, not traced by jit, got {shown(parameters)}: give numbers"
+            f"parameters must be finite numbers, not traced by jit, got {shown(parameters)}: give "
+            f"numbers"
         ) from None
-    if not sum(leaf.size for leaf in leaves) or not all(np.all(np.isfinite(leaf)) for leaf in leaves):
-        raise ValueError(f"parameters must be one finite number or more, got {shown(parameters)}: give others")
-    return ravel_pytree(jax.tree.unflatten(jax.tree.structure(parameters), [jnp.asarray(leaf) for leaf in leaves]))
+    if not sum(leaf.size for leaf in leaves) or not all(
+        np.all(np.isfinite(leaf)) for leaf in leaves
+    ):
+        raise ValueError(
+            f"parameters must be one finite number or more, got {shown(parameters)}: give others"
+        )
+    return ravel_pytree(
+        jax.tree.unflatten(jax.tree.structure(parameters), [jnp.asarray(leaf) for leaf in leaves])
+    )
 
 
 def _difference(of: Callable[[Any], Any], point: np.ndarray, i: int) -> tuple[float, float]:
-    """The derivative along coordinate i by extrapolated central differences, and an estimate of its error."""
+    """The derivative along coordinate i by extrapolated central differences, and an estimate of its
+    error.
+    """
     unit = abs(point[i]) or 1.0
     best, error, least = math.nan, math.inf, math.inf
     nothing = math.nan
     above: list[float] = []  # the row for the step before: D, and its extrapolations
     for level in range(_LEVELS):
         ends = point[i] + np.array([1.0, -1.0]) * (unit * _LARGEST_STEP / _RATIO**level)
-        values = [float(of(jnp.asarray(np.where(np.arange(point.size) == i, end, point)))) for end in ends]
+        values = [
+            float(of(jnp.asarray(np.where(np.arange(point.size) == i, end, point)))) for end in ends
+        ]
         step, largest = ends[0] - ends[1], max(abs(value) for value in values)
         nothing = nothing if nothing > 0 else _NOTHING * largest / unit
         row = [(values[0] - values[1]) / step]
@@ -213,7 +249,8 @@ def _difference(of: Callable[[Any], Any], point: np.ndarray, i: int) -> tuple[fl
         for order, coarse in enumerate(above, start=1):
             row.append(row[-1] + (row[-1] - coarse) / (_RATIO ** (2 * order) - 1))
             doubt = max(abs(row[-1] - row[-2]), abs(row[-1] - coarse)) + rounding
-            # Relative to itself: of a chaotic loss the differences over large steps are small, and so are their doubts.
+            # Relative to itself: of a chaotic loss the differences over large steps are small, and
+            # so are their doubts.
             relative = doubt / (abs(row[-1]) + nothing + np.finfo(float).tiny)
             if relative < least:  # False where a value was not finite
                 best, error, least = row[-1], doubt, relative
@@ -226,13 +263,20 @@ _TIMES = 256
 
 
 def gradient_horizon(
-    pendulum: Pendulum | Any, state: State | Any, duration: Any, scheme: Scheme | Any, *, tolerance: Any = 1e-3
+    pendulum: Pendulum | Any,
+    state: State | Any,
+    duration: Any,
+    scheme: Scheme | Any,
+    *,
+    tolerance: Any = 1e-3,
 ) -> GradientHorizon:
-    """How long the derivatives of a motion with respect to its start and its pendulum are right to `tolerance`.
+    """How long the derivatives of a motion with respect to its start and its pendulum are right to
+    `tolerance`.
 
-    The motion and its four tangents are integrated at the step and at half of it, side by side: what the derivatives
-    change by is their error, of the method and of rounding alike. Both grow like the tangents do, so that in chaos the
-    horizon grows only like the logarithm of the accuracy.
+    The motion and its four tangents are integrated at the step and at half of it, side by side:
+    what the derivatives change by is their error, of the method and of rounding alike. Both grow
+    like the tangents do, so that in chaos the horizon grows only like the logarithm of the
+    accuracy.
 
     Arguments:
         pendulum, state: leaves are numbers.
@@ -242,8 +286,8 @@ def gradient_horizon(
     Returns:
         GradientHorizon, at 256 even times or every step.
     Raises:
-        ValueError: duration not a finite number or shorter than a step; tolerance not positive; a scheme of uneven
-            steps.
+        ValueError: duration not a finite number or shorter than a step; tolerance not positive; a
+            scheme of uneven steps.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -252,7 +296,9 @@ def gradient_horizon(
     known = known_number("duration", duration, unit="s")
     tolerance = known_number("tolerance", tolerance, positive=True)
     if not scheme.even:
-        raise ValueError(f"scheme must take even steps, got {scheme.name!r}: give rk8-circle or rk8")
+        raise ValueError(
+            f"scheme must take even steps, got {scheme.name!r}: give rk8-circle or rk8"
+        )
     steps = scheme.steps(known)
     if not steps:
         raise ValueError("duration must not be zero, got 0 s: give a longer one")
@@ -277,8 +323,12 @@ def gradient_horizon(
 
 
 @partial(jax.jit, static_argnames="method")
-def _compared(pendulum: Pendulum, state: State, dt: Scalar, counts: Scalar, method: Scheme) -> tuple[Scalar, Scalar]:
-    """Growth and relative error of the tangents at the start and after each of `counts` steps more."""
+def _compared(
+    pendulum: Pendulum, state: State, dt: Scalar, counts: Scalar, method: Scheme
+) -> tuple[Scalar, Scalar]:
+    """Growth and relative error of the tangents at the start and after each of `counts` steps
+    more.
+    """
     size = norm(pendulum)
     whole, half = method.constants(pendulum, dt), method.constants(pendulum, dt / 2)
 

@@ -20,24 +20,31 @@ from dpend.methods.scheme import Scheme, check_scheme
 
 Carry = TypeVar("Carry")
 
-# Reverse mode keeps what every step computed, some 5 kB at order 8. Beyond this many steps it keeps the states between
-# blocks of sqrt(n) steps only and computes each block again.
+# Reverse mode keeps what every step computed, some 5 kB at order 8. Beyond this many steps it keeps
+# the states between blocks of sqrt(n) steps only and computes each block again.
 _CHECKPOINT_ABOVE = 1024
 
 
 def march(
-    step: Callable[[Carry, Scalar, Scalar], Carry], carry: Carry, dt: Scalar, steps: Scalar, first: Scalar = 0
+    step: Callable[[Carry, Scalar, Scalar], Carry],
+    carry: Carry,
+    dt: Scalar,
+    steps: Scalar,
+    first: Scalar = 0,
 ) -> Carry:
     """The loop under everything that takes even steps: `steps` times carry = step(carry, time, dt).
 
     Arguments:
         step: told the time [s] at the end of its step.
-        steps: an int compiles to a scan, which has both derivatives; a tracer to a loop with forward mode only.
+        steps: an int compiles to a scan, which has both derivatives; a tracer to a loop with
+            forward mode only.
         first: the number of the first step, from which the time is counted.
     """
 
     def run(carry: Carry, first: Scalar, count: Scalar) -> Carry:
-        return lax.fori_loop(0, count, lambda i, c: step(c, jnp.asarray(first + i + 1, jnp.float64) * dt, dt), carry)
+        return lax.fori_loop(
+            0, count, lambda i, c: step(c, jnp.asarray(first + i + 1, jnp.float64) * dt, dt), carry
+        )
 
     if not isinstance(steps, int) or steps <= _CHECKPOINT_ABOVE:
         return run(carry, first, steps)
@@ -51,7 +58,12 @@ def march(
 def moved(scheme: Scheme, pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar) -> State:
     """The state after `steps` even steps of `dt` [s]: `flow` for counts that may be traced."""
     constants = scheme.constants(pendulum, dt)
-    end = march(lambda point, time, dt: scheme.move(constants, point), scheme.enter(pendulum, state), dt, steps)
+    end = march(
+        lambda point, time, dt: scheme.move(constants, point),
+        scheme.enter(pendulum, state),
+        dt,
+        steps,
+    )
     return scheme.leave(constants, end)
 
 
@@ -64,13 +76,16 @@ def float64(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float64)), tree)
 
 
-# A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns ten thousand times
-# as fast as any that gravity moves: the lane is given up as NaN, so that no other waits for it.
+# A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns
+# ten thousand times as fast as any that gravity moves: the lane is given up as NaN, so that no
+# other waits for it.
 _SHORTEST_STEP = 1e-5
 
 
 class _Along(NamedTuple):
-    """What moves along a motion: the scheme's point, tangents (None without), and what `update` accumulates."""
+    """What moves along a motion: the scheme's point, tangents (None without), and what `update`
+    accumulates.
+    """
 
     point: Point
     tangents: State | None
@@ -100,20 +115,28 @@ class Turns(NamedTuple):
 
 
 def without_turns(state: State) -> tuple[State, Turns]:
-    """A state whose angles are near enough to zero to be rounded finely, and what they are without."""
+    """A state whose angles are near enough to zero to be rounded finely, and what they are
+    without.
+    """
     (theta1, turns1), (theta2, turns2) = unwound(state.theta1), unwound(state.theta2)
     return State(theta1, theta2, state.p1, state.p2), Turns(turns1, turns2)
 
 
 def with_turns(state: State, turns: Turns) -> State:
-    return State(wound(state.theta1, turns.theta1), wound(state.theta2, turns.theta2), state.p1, state.p2)
+    return State(
+        wound(state.theta1, turns.theta1), wound(state.theta2, turns.theta2), state.p1, state.p2
+    )
 
 
 def _stepped(update, turns, scheme, constants, along, time, dt):  # type: ignore[no-untyped-def]
     """One step shown to `update`."""
     if along.tangents is None:
         point = scheme.move(constants, along.point)
-        return _Along(point, None, update(along.carry, time, dt, with_turns(scheme.leave(constants, point), turns)))
+        return _Along(
+            point,
+            None,
+            update(along.carry, time, dt, with_turns(scheme.leave(constants, point), turns)),
+        )
     point, tangents = scheme.move_tangents(constants, along.point, along.tangents)
     state = with_turns(scheme.leave(constants, point), turns)
     carry, tangents = update(along.carry, time, dt, state, tangents)
@@ -122,8 +145,8 @@ def _stepped(update, turns, scheme, constants, along, time, dt):  # type: ignore
 
 @custom_vmap
 def _any_lane(going: Scalar) -> Scalar:
-    """Whether any lane goes on: a loop's condition that under `vmap` is one for all lanes, so that JAX does not select
-    every array of every step by it.
+    """Whether any lane goes on: a loop's condition that under `vmap` is one for all lanes, so that
+    JAX does not select every array of every step by it.
     """
     return going
 
@@ -136,7 +159,8 @@ def _any_of_many(size: int, batched: list[bool], going: Scalar) -> tuple[Scalar,
 def _unevenly(shown, pendulum, state, along, duration, scheme):  # type: ignore[no-untyped-def]
     """Steps in the scheme's own time, the last one cut to end at `duration`.
 
-    A lane that has arrived takes steps of length zero, which leave its point as it is to the bit, until all have.
+    A lane that has arrived takes steps of length zero, which leave its point as it is to the bit,
+    until all have.
     """
     sense = jnp.where(duration < 0, -1.0, 1.0)
     longest = scheme.step * scheme.pace(pendulum, state)
@@ -148,7 +172,8 @@ def _unevenly(shown, pendulum, state, along, duration, scheme):  # type: ignore[
     def advance(carried):  # type: ignore[no-untyped-def]
         along, time, before = carried
         spin = scheme.spin(unit, along.point)
-        # Between this step's start and its end u is not yet known: the last step's ratio tells where it goes.
+        # Between this step's start and its end u is not yet known: the last step's ratio tells
+        # where it goes.
         ahead = jnp.maximum(spin * (spin / before), 1.0)
         root = jnp.sqrt(ahead)
         dt = longest / (root * jnp.sqrt(jnp.sqrt(root)))
@@ -180,20 +205,24 @@ def _nothing(carry: Any, time: Scalar, dt: Scalar, state: State) -> Any:
     return carry
 
 
-def flow(pendulum: Pendulum | Any, state: State | Any, duration: Scalar, scheme: Scheme | Any) -> State:
+def flow(
+    pendulum: Pendulum | Any, state: State | Any, duration: Scalar, scheme: Scheme | Any
+) -> State:
     """The state after `duration`, no trajectory stored.
 
-    Even methods take n = ceil(duration/step - 1e-9) steps of duration/n each; the rescaled one takes steps in its own
-    time, the last one cut to end there.
+    Even methods take n = ceil(duration/step - 1e-9) steps of duration/n each; the rescaled one
+    takes steps in its own time, the last one cut to end there.
 
     Arguments:
         pendulum, state: leaves are scalars; `jax.vmap` maps over many.
-        duration: time [s]; negative runs backwards, zero returns the state. A number known at trace time, or a value
-            being differentiated by eager `grad`, fixes n and allows reverse mode (checkpointed beyond 1024 steps); a
-            traced one allows forward mode only, as does the rescaled method.
+        duration: time [s]; negative runs backwards, zero returns the state. A number known at trace
+            time, or a value being differentiated by eager `grad`, fixes n and allows reverse mode
+            (checkpointed beyond 1024 steps); a traced one allows forward mode only, as does the
+            rescaled method.
         scheme: method and step.
     Raises:
-        ValueError: duration not finite, or shorter than one even step; arguments of other classes, arrays.
+        ValueError: duration not finite, or shorter than one even step; arguments of other classes,
+            arrays.
         RuntimeError: float64 is switched off in JAX.
     """
     end, _, _ = _accumulate(_nothing, None, pendulum, state, None, duration, scheme)
@@ -213,17 +242,19 @@ def fold(
     """Something accumulated along the motion: `init` after `update` has seen every step.
 
     Arguments:
-        update: (carry, time, dt, state) -> carry, called after each step with the time [s] at its end, its length and
-            the state there. With `tangents`, (carry, time, dt, state, tangents) -> (carry, tangents): it sees them and
-            may scale or replace them. Compiled functions are kept by its identity: define it once, not in a loop.
+        update: (carry, time, dt, state) -> carry, called after each step with the time [s] at its
+            end, its length and the state there. With `tangents`, (carry, time, dt, state, tangents)
+            -> (carry, tangents): it sees them and may scale or replace them. Compiled functions are
+            kept by its identity: define it once, not in a loop.
         init: any pytree; Python numbers in it become float64.
         pendulum, state, duration, scheme: as for `flow`.
-        tangents: vectors (d theta1, d theta2, d p1, d p2) at t = 0 to carry along by the derivative of the flow: one,
-            or several along a leading axis.
+        tangents: vectors (d theta1, d theta2, d p1, d p2) at t = 0 to carry along by the derivative
+            of the flow: one, or several along a leading axis.
     Returns:
         What `update` made of `init`; with `tangents`, that and the tangents at the end.
     Raises:
-        ValueError: duration not finite, or shorter than one even step; arguments of other classes, arrays.
+        ValueError: duration not finite, or shorter than one even step; arguments of other classes,
+            arrays.
         RuntimeError: float64 is switched off in JAX.
     """
     example = "lambda carry, time, dt, state: jnp.maximum(carry, state.theta1)"
@@ -258,8 +289,12 @@ def known_duration(duration: Scalar) -> float | None:
     """The length of a motion [s], checked; None where it is traced."""
     single("duration", number("duration", duration, unit="s"))
     known = known_value(duration)
-    if known is not None and not math.isfinite(known):  # under eager differentiation `number` does not see it
-        raise ValueError(f"duration must be a finite number [s], got {known}: give another duration")
+    if known is not None and not math.isfinite(
+        known
+    ):  # under eager differentiation `number` does not see it
+        raise ValueError(
+            f"duration must be a finite number [s], got {known}: give another duration"
+        )
     return known
 
 

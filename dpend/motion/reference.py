@@ -18,11 +18,13 @@ from dpend.motion.integrate import float64
 from dpend.motion.simulate import Trajectory, energy_drift
 from dpend.status import Status
 
-# Steps, if nobody asks for more: at 20 microseconds each they take half a minute, as the most steps of `simulate` do.
+# Steps, if nobody asks for more: at 20 microseconds each they take half a minute, as the most steps
+# of `simulate` do.
 _MOST_ADAPTIVE_STEPS = 1_000_000
 
-# The change at ten times the tolerance is some eight times the error, but in two of a hundred random motions less, at
-# the worst 0.31 of it, where a small swing takes 18 steps (tolerances 1e-7 to 1e-13, against long double).
+# The change at ten times the tolerance is some eight times the error, but in two of a hundred
+# random motions less, at the worst 0.31 of it, where a small swing takes 18 steps (tolerances 1e-7
+# to 1e-13, against long double).
 _CHANGES = 5.0
 
 
@@ -35,23 +37,26 @@ def reference(
     error: bool | Any = True,
     most_steps: int | Any = _MOST_ADAPTIVE_STEPS,
 ) -> Trajectory:
-    """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's integrators.
+    """The motion at `times` by diffrax's Dopri8 with adaptive steps: independent of this package's
+    integrators.
 
-    It takes as many steps as it needs, up to `most_steps`. The error estimate is five times the change when the
-    tolerance is ten times larger, and what one rounding of the start grows to.
+    It takes as many steps as it needs, up to `most_steps`. The error estimate is five times the
+    change when the tolerance is ten times larger, and what one rounding of the start grows to.
 
     Arguments:
         pendulum, state: leaves are scalars; `state` holds at t = 0.
         times: increasing from zero or more, or decreasing from zero or less [s], shape (n,).
-        tolerance: relative and absolute, of angles [rad] and of momenta in units of the motion's own inertia and rate;
-            1e-13 is the least that rounding leaves room for.
+        tolerance: relative and absolute, of angles [rad] and of momenta in units of the motion's
+            own inertia and rate; 1e-13 is the least that rounding leaves room for.
         error: make the second solution. Without it `error_estimate` is NaN.
         most_steps: how many steps are taken at most; each number has a program of its own.
     Returns:
-        Trajectory, its `steps` those of the better solution; status `MAX_ITERATIONS` where that would be more than
+        Trajectory, its `steps` those of the better solution; status `MAX_ITERATIONS` where that
+        would be more than
             `most_steps`, `NONFINITE` where diffrax gave up otherwise.
     Raises:
-        ValueError: times empty, not finite, not monotonic or on both sides of zero; tolerance below 1e-13.
+        ValueError: times empty, not finite, not monotonic or on both sides of zero; tolerance below
+            1e-13.
         RuntimeError: float64 is switched off in JAX.
     """
     require_float64()
@@ -62,12 +67,15 @@ def reference(
     known = known_value(tolerance)
     if known is not None and not known >= _LEAST_TOLERANCE:
         raise ValueError(
-            f"tolerance must be at least {_LEAST_TOLERANCE:g}, which rounding leaves room for, got {known:g}: "
+            f"tolerance must be at least {_LEAST_TOLERANCE:g}, which rounding leaves room for, got "
+            f"{known:g}: "
             "give a larger tolerance"
         )
     grid = np.atleast_1d(numbers("times", times, unit="s"))
     if grid.ndim != 1:
-        raise ValueError(f"times must have one dimension, got shape {grid.shape}: give one number for each time")
+        raise ValueError(
+            f"times must have one dimension, got shape {grid.shape}: give one number for each time"
+        )
     moves = np.diff(grid, prepend=0.0)
     ordered = (
         np.all(moves[1:] > 0) and grid[0] >= 0
@@ -75,36 +83,54 @@ def reference(
         else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
     )
     if not grid.size or not np.all(np.isfinite(grid)) or not ordered:
-        raise ValueError(f"times must be finite and move away from zero in one direction, got {shown(grid)}: sort them")
+        raise ValueError(
+            f"times must be finite and move away from zero in one direction, got {shown(grid)}: "
+            f"sort them"
+        )
     state = float64(state)
     roundings = count_roundings(state) if error else None
-    states, growth, steps, done = _dopri8(pendulum, state, roundings, jnp.asarray(grid), tolerance, most_steps)
+    states, growth, steps, done = _dopri8(
+        pendulum, state, roundings, jnp.asarray(grid), tolerance, most_steps
+    )
     estimate = jnp.asarray(jnp.nan)
     if error:
-        coarse = _dopri8(pendulum, state, roundings, jnp.asarray(grid), 10 * tolerance, most_steps)[0]
+        coarse = _dopri8(pendulum, state, roundings, jnp.asarray(grid), 10 * tolerance, most_steps)[
+            0
+        ]
         estimate = _CHANGES * angle_error(states, coarse) + jnp.fmin(EPS * growth, jnp.pi)
     with_start = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), state, states)
     lost = jnp.where(steps < most_steps, Status.NONFINITE, Status.MAX_ITERATIONS)
     status = jnp.where(done, Status.CONVERGED, lost)
-    return Trajectory(jnp.asarray(grid), states, energy_drift(pendulum, with_start), estimate, steps, status)
+    return Trajectory(
+        jnp.asarray(grid), states, energy_drift(pendulum, with_start), estimate, steps, status
+    )
 
 
-# Below this the rounding of a step is more than the error that its size is chosen by: all are taken back for ever.
+# Below this the rounding of a step is more than the error that its size is chosen by: all are taken
+# back for ever.
 _LEAST_TOLERANCE = 1e-13
 
 
 @partial(jax.jit, static_argnames="most_steps")
 def _dopri8(pendulum, state, tangents, times, tolerance, most_steps):  # type: ignore[no-untyped-def]
-    """States at `times`, what tangents of the angles grow to, steps taken, and whether diffrax succeeded."""
+    """States at `times`, what tangents of the angles grow to, steps taken, and whether diffrax
+    succeeded.
+    """
     import diffrax
 
     rate = jnp.fmax(fast_frequency(pendulum), fastest_rod(pendulum, state))
-    unit = State(1.0, 1.0, (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * rate, pendulum.m2 * pendulum.l2**2 * rate)
+    unit = State(
+        1.0,
+        1.0,
+        (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * rate,
+        pendulum.m2 * pendulum.l2**2 * rate,
+    )
 
     def field(scaled: State) -> State:
         here = jax.tree.map(jnp.multiply, scaled, unit)
         slopes = jax.tree.map(jnp.divide, vector_field(pendulum, here), unit)
-        # A slope that is not a number would have its step retried for ever: stand still there, and say so at the end.
+        # A slope that is not a number would have its step retried for ever: stand still there, and
+        # say so at the end.
         return jax.tree.map(lambda leaf: jnp.where(_in_reach(here), leaf, 0.0), slopes)
 
     def slope(time, pair, nothing):  # type: ignore[no-untyped-def]
@@ -151,6 +177,8 @@ def _of_the_state(pair: tuple[State, State | None]) -> Scalar:
 
 
 def _in_reach(state: State) -> Scalar:
-    """Whether the vector field can be computed here: finite, and angles that sine and cosine can reduce."""
+    """Whether the vector field can be computed here: finite, and angles that sine and cosine can
+    reduce.
+    """
     angles = jnp.maximum(jnp.abs(state.theta1), jnp.abs(state.theta2))
     return (angles <= LARGEST_ANGLE) & jnp.isfinite(state.p1) & jnp.isfinite(state.p2)

@@ -1,15 +1,18 @@
-"""Multiple shooting: a symmetric orbit in segments, and the step from one orbit of a family to the next.
+"""Multiple shooting: a symmetric orbit in segments, and the step from one orbit of a family to the
+next.
 
-A quarter (centred) or half (brake, odd) of the period is cut into segments that are integrated side by side, each from
-its own initial state, the node; Newton's method makes their ends meet. No segment is long enough for the motion to
-forget where it began, so that orbits can be followed to where kappa is 1e40 and shooting in one piece would see noise.
+A quarter (centred) or half (brake, odd) of the period is cut into segments that are integrated side
+by side, each from its own initial state, the node; Newton's method makes their ends meet. No
+segment is long enough for the motion to forget where it began, so that orbits can be followed to
+where kappa is 1e40 and shooting in one piece would see noise.
 
-The duration of a segment is Delta/rate(node): every segment is given the same share Delta of the fastest motion, and
-that makes the mesh follow the orbit smoothly, without ever being laid anew. Delta is the last unknown: it takes the
-place of the period, and grows only like its logarithm does where a motion lingers at an equilibrium.
+The duration of a segment is Delta/rate(node): every segment is given the same share Delta of the
+fastest motion, and that makes the mesh follow the orbit smoothly, without ever being laid anew.
+Delta is the last unknown: it takes the place of the period, and grows only like its logarithm does
+where a motion lingers at an equilibrium.
 
-Everything here is in natural units, l1 = m1 = g = 1: a pendulum is then (l2/l1, m2/m1), and the scaling laws hold to
-the last digit.
+Everything here is in natural units, l1 = m1 = g = 1: a pendulum is then (l2/l1, m2/m1), and the
+scaling laws hold to the last digit.
 """
 
 from typing import Any, NamedTuple
@@ -34,21 +37,22 @@ SYMMETRIES = ("centred", "brake", "odd")
 # What part of the period the arc is.
 PARTS = {"centred": 4, "brake": 2, "odd": 2}
 
-# Only its method is used: the number of steps is settled arc by arc. With its stages as a loop it takes twice the time,
-# and a tenth of it to compile.
+# Only its method is used: the number of steps is settled arc by arc. With its stages as a loop it
+# takes twice the time, and a tenth of it to compile.
 METHOD = Scheme("rk8-circle", 1.0, written_out=False)
-# The fastest motion may advance by this in one step [rad]: leaves little but rounding in the angles and the period.
+# The fastest motion may advance by this in one step [rad]: leaves little but rounding in the angles
+# and the period.
 TURN = 0.14
 MOST_SEGMENT_STEPS = 5_000
 
-# Where the unknowns are: the nodes one after the other, log Delta, and the unfolding parameter of odd orbits, which is
-# zero on every orbit.
+# Where the unknowns are: the nodes one after the other, log Delta, and the unfolding parameter of
+# odd orbits, which is zero on every orbit.
 LOG_DELTA, UNFOLDING = 4 * SEGMENTS, 4 * SEGMENTS + 1
 
 
 class Arc(NamedTuple):
-    """What is asked of an arc: the index of its symmetry, and the full turns of its end (theta/pi if centred, else
-    theta(0) + theta(T/2) in units of 2 pi).
+    """What is asked of an arc: the index of its symmetry, and the full turns of its end (theta/pi
+    if centred, else theta(0) + theta(T/2) in units of 2 pi).
     """
 
     symmetry: Any
@@ -68,7 +72,9 @@ class _Segments(NamedTuple):
     slope: Float[Array, "S 4"]  # at its end
     time: Float[Array, " S"]
     stretch: Float[Array, "S 4"]  # derivative of its time with respect to the node
-    turn: Float[Array, " S"]  # the larger of the advances that the rates at both ends make of it [rad]
+    turn: Float[
+        Array, " S"
+    ]  # the larger of the advances that the rates at both ends make of it [rad]
 
 
 def stack_state(state: State) -> Array:
@@ -80,7 +86,8 @@ def _field(pendulum: Pendulum, state: State) -> Array:
 
 
 def _segments(pendulum: Pendulum, nodes: Array, delta: Scalar, steps: Scalar) -> _Segments:
-    # States have leaves of shape (S,): the last axis, which is contiguous, is the one that is vectorised.
+    # States have leaves of shape (S,): the last axis, which is contiguous, is the one that is
+    # vectorised.
     states = State(*nodes.T)
     rate, pull = jax.vjp(lambda states: fastest(pendulum, states), states)
     (gradient,) = pull(jnp.ones(SEGMENTS))
@@ -109,7 +116,9 @@ class Equations(NamedTuple):
 
 
 def shooting_equations(pendulum: Pendulum, point: Array, steps: Scalar, arc: Arc) -> Equations:
-    """4 S + 1 equations: each segment ends where the next begins, and five conditions on the first node and the end."""
+    """4 S + 1 equations: each segment ends where the next begins, and five conditions on the first
+    node and the end.
+    """
     nodes = point[:LOG_DELTA].reshape(SEGMENTS, 4)
     s = _segments(pendulum, nodes, jnp.exp(point[LOG_DELTA]), steps)
     by_node = s.matrix + s.slope[:, :, None] * s.stretch[:, None, :]
@@ -131,14 +140,17 @@ _DIAGONAL = np.eye(SEGMENTS)[:, None, :, None]
 _NEXT = np.einsum("ij,ab->iajb", np.eye(SEGMENTS, k=1), np.eye(4))
 
 
-def end_conditions(pendulum: Pendulum, start: Array, end: Array, unfolding: Scalar, arc: Arc) -> tuple[Array, Array]:
+def end_conditions(
+    pendulum: Pendulum, start: Array, end: Array, unfolding: Scalar, arc: Arc
+) -> tuple[Array, Array]:
     """Five conditions on (start, end, unfolding), and their derivative, shape (5, 9).
 
     - centred: p(0) = 0, theta(T/4) = pi turns;
     - brake: p(0) = 0, p(T/2) = 0;
-    - odd: x(T/2) = -x(0) up to full turns, where the upper rod is at its extreme, theta1' = 0. Energy is conserved, so
-      that these are one too many for the period and the state; the unfolding parameter times grad H, added to them, is
-      zero at every solution (Munoz-Almaraz et al., Physica D 181 (2003)).
+    - odd: x(T/2) = -x(0) up to full turns, where the upper rod is at its extreme, theta1' = 0.
+      Energy is conserved, so that these are one too many for the period and the state; the
+      unfolding parameter times grad H, added to them, is zero at every solution (Munoz-Almaraz et
+      al., Physica D 181 (2003)).
     """
     full_turns = jnp.append(2 * jnp.pi * arc.turns, jnp.zeros(2))
 
@@ -162,23 +174,29 @@ def _rows(*columns: int) -> np.ndarray:
     return np.eye(9)[list(columns)]
 
 
-# The derivatives of the conditions of orbits released from rest: of p(0), of theta or p at the end, of the unfolding.
+# The derivatives of the conditions of orbits released from rest: of p(0), of theta or p at the end,
+# of the unfolding.
 _AT_REST = {"centred": _rows(2, 3, 4, 5, 8), "brake": _rows(2, 3, 6, 7, 8)}
 
-# L and U in one matrix, and the order of the rows: what `lax.linalg.lu` has found already, and `lu_solve` finds anew.
+# L and U in one matrix, and the order of the rows: what `lax.linalg.lu` has found already, and
+# `lu_solve` finds anew.
 Factors = tuple[Array, Array]
 
 
 def solve(factors: Factors, right: Array) -> Array:
     lu, order = factors
-    half = lax.linalg.triangular_solve(lu, right[order], left_side=True, lower=True, unit_diagonal=True)
+    half = lax.linalg.triangular_solve(
+        lu, right[order], left_side=True, lower=True, unit_diagonal=True
+    )
     return lax.linalg.triangular_solve(lu, half, left_side=True)
 
 
 def solve_transposed(factors: Factors, right: Array) -> Array:
     lu, order = factors
     half = lax.linalg.triangular_solve(lu, right, left_side=True, transpose_a=True)
-    whole = lax.linalg.triangular_solve(lu, half, left_side=True, lower=True, unit_diagonal=True, transpose_a=True)
+    whole = lax.linalg.triangular_solve(
+        lu, half, left_side=True, lower=True, unit_diagonal=True, transpose_a=True
+    )
     return jnp.zeros_like(right).at[order].set(whole)
 
 
@@ -197,7 +215,9 @@ def laid(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -> A
         nearest = jnp.searchsorted(times, time, side="right") - 1
         rest = time - times[nearest]
         steps = jnp.clip(jnp.ceil(rest * rate / TURN), 1, 100 * MOST_SEGMENT_STEPS).astype(int)
-        return stack_state(moved(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps))
+        return stack_state(
+            moved(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps)
+        )
 
     def nodes(delta: Scalar) -> tuple[Scalar, Array]:
         def step(time: Scalar, _: None) -> tuple[Scalar, Array]:

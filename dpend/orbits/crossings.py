@@ -14,7 +14,9 @@ from dpend.orbits.walk import CROSSING
 
 @dataclass(frozen=True, eq=False)
 class Zone:
-    """A stretch of a curve where another one is so close that points on it have the tangent of either."""
+    """A stretch of a curve where another one is so close that points on it have the tangent of
+    either.
+    """
 
     place: float  # of the crossing
     ends: np.ndarray
@@ -23,7 +25,8 @@ class Zone:
     def row_at(self, problem: Problem, where: float) -> Corrected:
         """The point at an arclength in it; slopes there are those between its ends.
 
-        Where no Newton's iteration converges, on the crossing itself, a point next to it stands for it.
+        Where no Newton's iteration converges, on the crossing itself, a point next to it stands for
+        it.
         """
         chord, index = curve_of(self.rows), np.zeros(len(_BESIDE), int)
         shares = (where + np.array(_BESIDE) - self.ends[0]) / (self.ends[1] - self.ends[0])
@@ -31,14 +34,18 @@ class Zone:
         rows = problem.corrected(chord.between(index, shares), METRIC * tangents, steps)
         best = int(np.argmax(rows.converged > 0))
         mixed = {
-            name: np.einsum("i,i...->...", [1 - shares[0], shares[0]], getattr(self.rows, name))[None]
+            name: np.einsum("i,i...->...", [1 - shares[0], shares[0]], getattr(self.rows, name))[
+                None
+            ]
             for name in ("tangent", "time_slope", "energy_slope")
         }
         return some_of(rows, slice(best, best + 1))._replace(**mixed)
 
     def steepness(self, problem: Problem) -> float:
         """The slope of c, of brake orbits kappa, between its ends."""
-        return float(np.diff(measure_of(self.rows, problem.symmetry))[0] / (self.ends[1] - self.ends[0]))
+        return float(
+            np.diff(measure_of(self.rows, problem.symmetry))[0] / (self.ends[1] - self.ends[0])
+        )
 
     def holds(self, low: float, high: float) -> bool:
         """Whether a stretch of the curve contains it."""
@@ -52,7 +59,9 @@ _BESIDE = (0.0, 1e-5, -1e-5, 5e-5, -5e-5)
 
 
 def crossings(track: Track, samples: Samples) -> list[Zone]:
-    """The stretches of a curve where the determinant changes sign, found by bisection; those that overlap are one."""
+    """The stretches of a curve where the determinant changes sign, found by bisection; those that
+    overlap are one.
+    """
     where, side = samples.where, samples.rows.side
     (changes,) = np.nonzero(side[:-1] * side[1:] < 0)
     if not changes.size:
@@ -63,7 +72,8 @@ def crossings(track: Track, samples: Samples) -> list[Zone]:
         before = track.rows_at(middle).side == side[changes]
         low, high = np.where(before, middle, low), np.where(before, high, middle)
     places = 0.5 * (low + high)
-    # Where the walk had to leap, the curves turn into each other: ten times as far away by a twentieth at most.
+    # Where the walk had to leap, the curves turn into each other: ten times as far away by a
+    # twentieth at most.
     wide = np.where(where[changes + 1] - where[changes] > 4 * CROSSING, 10 * CROSSING, CROSSING)
     starts, ends = np.maximum(places - wide, where[0]), np.minimum(places + wide, where[-1])
     groups = np.cumsum(np.append(True, starts[1:] > ends[:-1]))

@@ -1,4 +1,6 @@
-"""The curve through the points of a family, in NumPy: parts of it, both ways of it, and its return to itself."""
+"""The curve through the points of a family, in NumPy: parts of it, both ways of it, and its return
+to itself.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +13,9 @@ from dpend.orbits.walk import hermite
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Points of a curve with unit tangents; of a family that begins in a normal mode, the mode itself is the first."""
+    """Points of a curve with unit tangents; of a family that begins in a normal mode, the mode
+    itself is the first.
+    """
 
     points: np.ndarray
     tangents: np.ndarray
@@ -29,19 +33,23 @@ class Curve:
         return np.asarray(hermite(start, slope, end, end_slope, self.lengths[index], share)).T
 
     def tangents_between(self, index: np.ndarray, share: np.ndarray) -> np.ndarray:
-        mixed = (1 - share)[:, None] * self.tangents[index] + share[:, None] * self.tangents[index + 1]
+        mixed = (1 - share)[:, None] * self.tangents[index] + share[:, None] * self.tangents[
+            index + 1
+        ]
         return mixed / np.sqrt(np.sum(METRIC * mixed**2, axis=1))[:, None]
 
 
-# Points at the beginning that are not looked at for a return; and what counts as one [rad, and log of the time].
+# Points at the beginning that are not looked at for a return; and what counts as one [rad, and log
+# of the time].
 LEAVING, SAME_PLACE = 4, 1e-7
 
 
 def cut_at_return(rows: Corrected, count: int) -> tuple[Corrected, str]:
-    """A curve that has come back after `count` points: closed, unless it only turned round at a branch point.
+    """A curve that has come back after `count` points: closed, unless it only turned round at a
+    branch point.
 
-    Where it meets a more symmetric family, a curve goes on through the same orbits, met at their other rests, as often
-    as it took to get there.
+    Where it meets a more symmetric family, a curve goes on through the same orbits, met at their
+    other rests, as often as it took to get there.
     """
     rows = some_of(rows, slice(count))
     lengths = np.cumsum(curve_of(rows).lengths)
@@ -50,11 +58,14 @@ def cut_at_return(rows: Corrected, count: int) -> tuple[Corrected, str]:
     return (some_of(rows, slice(half[0] + 1)), "branch point") if half else (rows, "closed")
 
 
-def without_its_image(rows: Corrected, ends: tuple[str, str], here: int) -> tuple[Corrected, tuple[str, str]]:
-    """The part of a curve of brake orbits with the point `here` that does not hold them a second time, and its ends.
+def without_its_image(
+    rows: Corrected, ends: tuple[str, str], here: int
+) -> tuple[Corrected, tuple[str, str]]:
+    """The part of a curve of brake orbits with the point `here` that does not hold them a second
+    time, and its ends.
 
-    Through a branch point, where its orbits become more symmetric ones, a curve goes on with the same orbits, met at
-    their other rests.
+    Through a branch point, where its orbits become more symmetric ones, a curve goes on with the
+    same orbits, met at their other rests.
     """
     (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
     for i in crossings.tolist():
@@ -62,24 +73,31 @@ def without_its_image(rows: Corrected, ends: tuple[str, str], here: int) -> tupl
             continue
         if here <= i:
             return without_its_image(some_of(rows, slice(i + 1)), (ends[0], "branch point"), here)
-        return without_its_image(some_of(rows, slice(i + 1, None)), ("branch point", ends[1]), here - i - 1)
+        return without_its_image(
+            some_of(rows, slice(i + 1, None)), ("branch point", ends[1]), here - i - 1
+        )
     return rows, ends
 
 
 def half_of_closed(rows: Corrected) -> Corrected | None:
-    """Of a closed curve that holds its orbits twice, from a branch point to another and back, the half it begins in."""
+    """Of a closed curve that holds its orbits twice, from a branch point to another and back, the
+    half it begins in.
+    """
     (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
     if crossings.size < 2 or not _reflects(rows, crossings[0]):
         return None
-    return joined(some_of(rows, slice(crossings[-1] + 1, None)), some_of(rows, slice(crossings[0] + 1)))
+    return joined(
+        some_of(rows, slice(crossings[-1] + 1, None)), some_of(rows, slice(crossings[0] + 1))
+    )
 
 
 def _reflects(rows: Corrected, crossing: Any) -> bool:
-    """Whether the points on both sides of a crossing are each other's images: their orbits' other rests, in the mirror
-    or not.
+    """Whether the points on both sides of a crossing are each other's images: their orbits' other
+    rests, in the mirror or not.
     """
     shorter, longer = sorted(
-        (some_of(rows, slice(crossing + 1)), some_of(rows, slice(crossing + 1, None))), key=lambda part: len(part.point)
+        (some_of(rows, slice(crossing + 1)), some_of(rows, slice(crossing + 1, None))),
+        key=lambda part: len(part.point),
     )
     if len(shorter.point) < LEAVING:
         return False
@@ -106,14 +124,20 @@ def release_and_time(rows: Corrected) -> np.ndarray:
 
 
 def way_to(where: np.ndarray, release: np.ndarray) -> np.ndarray:
-    """From one (theta1, theta2, log of the time) to the other, angles modulo 2 pi; shape (..., 3)."""
+    """From one (theta1, theta2, log of the time) to the other, angles modulo 2 pi; shape (...,
+    3).
+    """
     way = release - where
     way[..., :2] -= 2 * np.pi * np.round(way[..., :2] / (2 * np.pi))
     return way
 
 
-def away_from(start: np.ndarray, end: np.ndarray, release: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far a release is from the chords between points, and how long these are, shape (n,) both."""
+def away_from(
+    start: np.ndarray, end: np.ndarray, release: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far a release is from the chords between points, and how long these are, shape (n,)
+    both.
+    """
     chord, to = end - start, way_to(start, release)
     length = np.maximum(np.linalg.norm(chord, axis=1), np.finfo(float).tiny)
     share = np.clip(np.sum(to * chord, axis=1) / length**2, 0.0, 1.0)
@@ -132,7 +156,10 @@ def turned(rows: Corrected) -> Corrected:
     """The same points, met in the opposite order."""
     back = some_of(rows, slice(None, None, -1))
     return back._replace(
-        tangent=-back.tangent, time_slope=-back.time_slope, energy_slope=-back.energy_slope, side=-back.side
+        tangent=-back.tangent,
+        time_slope=-back.time_slope,
+        energy_slope=-back.energy_slope,
+        side=-back.side,
     )
 
 

@@ -1,15 +1,17 @@
 """Periodic orbits released from rest, by symmetric shooting with Newton's method.
 
-Shooting for a periodic orbit of a conservative system is singular by two. Released from rest it is not: with theta1
-given, theta2 and the period are two unknowns for two equations, without a phase or an energy condition.
+Shooting for a periodic orbit of a conservative system is singular by two. Released from rest it is
+not: with theta1 given, theta2 and the period are two unknowns for two equations, without a phase or
+an energy condition.
 
 - brake: p(T/2) = 0, at rest again at the dual release;
-- centred: theta(T/4) = 0 modulo pi, half the integration. The reversal (theta, p, t) -> (-theta, p, -t) about T/4 then
-  gives x(T/2) = -x(0) up to full turns.
+- centred: theta(T/4) = 0 modulo pi, half the integration. The reversal (theta, p, t) -> (-theta, p,
+  -t) about T/4 then gives x(T/2) = -x(0) up to full turns.
 
-A branch is followed from its normal mode by the walk that families take (`walk`), turning points in theta1
-included; the orbit that it leads to is solved in one piece. Everything is traceable; derivatives with respect to the
-pendulum and the release angle come from the implicit function theorem at the root, never from Newton's iterations.
+A branch is followed from its normal mode by the walk that families take (`walk`), turning points in
+theta1 included; the orbit that it leads to is solved in one piece. Everything is traceable;
+derivatives with respect to the pendulum and the release angle come from the implicit function
+theorem at the root, never from Newton's iterations.
 """
 
 import math
@@ -24,8 +26,26 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpend._runtime import require_float64
-from dpend.checks import Scalar, at_most_one, flag, integer, is_traced, known_value, number, one_of, several, single
-from dpend.mechanics.pendulum import Pendulum, State, check_pendulum, known_pendulum, released, vector_field
+from dpend.checks import (
+    Scalar,
+    at_most_one,
+    flag,
+    integer,
+    is_traced,
+    known_value,
+    number,
+    one_of,
+    several,
+    single,
+)
+from dpend.mechanics.pendulum import (
+    Pendulum,
+    State,
+    check_pendulum,
+    known_pendulum,
+    released,
+    vector_field,
+)
 from dpend.mechanics.units import natural
 from dpend.motion.integrate import step_size
 from dpend.orbits.arc import PARTS, arc_of, arc_times
@@ -46,10 +66,12 @@ from dpend.orbits.single import (
 from dpend.orbits.walk import Walk, beginning, hermite, stride
 from dpend.status import Status
 
-# The longest step in arclength: its cubic is true to a thousandth, from where Newton's method goes on.
+# The longest step in arclength: its cubic is true to a thousandth, from where Newton's method goes
+# on.
 _LONGEST_STEP = 0.25
 _MOST_POINTS = 5000
-# Each step is looked at in this many pieces for crossings: no step turns enough to cross twice within one of them.
+# Each step is looked at in this many pieces for crossings: no step turns enough to cross twice
+# within one of them.
 _PIECES = 16
 
 
@@ -67,11 +89,14 @@ class _Search(NamedTuple):
     status: Scalar
 
 
-def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar, ratio: Scalar) -> _Search:
+def _searched(
+    pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar, ratio: Scalar
+) -> _Search:
     """Follows a centred family from its normal mode to where it meets the wanted release.
 
-    With `ratio` zero that is the `crossing`-th time that |theta1| = target; the orbit released at (-theta1, -theta2) is
-    the same one, half a period later. Otherwise it is the release with theta2 = ratio theta1 nearest to `target`.
+    With `ratio` zero that is the `crossing`-th time that |theta1| = target; the orbit released at
+    (-theta1, -theta2) is the same one, half a period later. Otherwise it is the release with theta2
+    = ratio theta1 nearest to `target`.
     """
     scaled = natural(pendulum)
     arc = arc_of("centred")
@@ -87,7 +112,9 @@ def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar
             iterations=new.iterations,
             points=s.points + 1,
             reach=jnp.where(further, new.point, s.reach),
-            status=jnp.where(end == 1, jnp.where(s.found, Status.CONVERGED, Status.NO_SUCH_ORBIT), RUNNING),
+            status=jnp.where(
+                end == 1, jnp.where(s.found, Status.CONVERGED, Status.NO_SUCH_ORBIT), RUNNING
+            ),
         )
         after = _looked_at(after, wanted, target, crossing, ratio)
         before = s._replace(walk=walk, status=jnp.where(end == 2, Status.LEFT_BRANCH, RUNNING))
@@ -100,9 +127,16 @@ def _searched(pendulum: Pendulum, slow: Scalar, target: Scalar, crossing: Scalar
     finite = jnp.isfinite(target + jnp.sum(begin.point) + jnp.sum(begin.tangent))
     zero = jnp.asarray(0)
     start = _Search(
-        begin, iterations=zero, points=zero, attempts=zero, crossings=zero, best=begin.point, reach=begin.point,
-        found=jnp.asarray(False), status=jnp.where(finite, RUNNING, Status.NONFINITE),
-    )  # fmt: skip
+        begin,
+        iterations=zero,
+        points=zero,
+        attempts=zero,
+        crossings=zero,
+        best=begin.point,
+        reach=begin.point,
+        found=jnp.asarray(False),
+        status=jnp.where(finite, RUNNING, Status.NONFINITE),
+    )
     return lax.while_loop(lambda s: s.status == RUNNING, advance, start)
 
 
@@ -150,8 +184,8 @@ def _timed(pendulum: Pendulum, point: Array) -> tuple[Scalar, Scalar]:
 
 @partial(jax.jit, static_argnames="error")
 def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, max_iterations):  # type: ignore[no-untyped-def]
-    """The orbit where a branch meets theta1 for the `crossing`-th time; if `ratio` is not zero, theta2 = ratio theta1
-    nearest to it.
+    """The orbit where a branch meets theta1 for the `crossing`-th time; if `ratio` is not zero,
+    theta2 = ratio theta1 nearest to it.
     """
     fixed = lax.stop_gradient(pendulum)
     sign = jnp.where(theta1 < 0, -1.0, 1.0)
@@ -163,7 +197,8 @@ def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, 
     guess = point[:2] * jnp.where(point[0] < 0, -1.0, 1.0)  # the same orbit, from its other rest
     at_angle = ratio == 0
     release = jnp.where(found, target, guess[0])
-    # The cubic's theta2 belongs to the cubic's theta1, which is off by rounding where the target is tiny.
+    # The cubic's theta2 belongs to the cubic's theta1, which is off by rounding where the target is
+    # tiny.
     x = jnp.where(at_angle, guess[1] * lax.stop_gradient(release) / guess[0], guess[0])
     zero = jnp.zeros(())
     base = jnp.stack([jnp.where(at_angle, release, zero), zero])
@@ -176,20 +211,23 @@ def _on_branch(pendulum, theta1, slow, crossing, ratio, error, turn, tolerance, 
     turns = jnp.zeros(2)
     newton, steps, change = solve_twice(fixed, still, x, log_time, rate, turns, "centred", settings)
     moved = jnp.abs(newton.x - x) > _LEFT * jnp.maximum(search.walk.length, jnp.abs(x))
-    status = jnp.where((newton.status == Status.CONVERGED) & moved, Status.LEFT_BRANCH, newton.status)
+    status = jnp.where(
+        (newton.status == Status.CONVERGED) & moved, Status.LEFT_BRANCH, newton.status
+    )
     status = jnp.where(found, status, search.status)
     newton = newton._replace(iterations=newton.iterations + search.iterations)
     orbit = orbit_at_root(pendulum, line, newton, steps, change, turns, "centred", status)
     return mirrored(orbit, sign)
 
 
-# The walk's cubic is true to a few thousandths of its step: a root further away than this share of it is another orbit.
+# The walk's cubic is true to a few thousandths of its step: a root further away than this share of
+# it is another orbit.
 _LEFT = 0.1
 
 
-# How fast either rod may turn where the motion rests, in units of its fastest before: the root has 1e-12, and grows by
-# no more than the root of 1e16 up to the first of several rests. And how near to an equilibrium a search may end, in
-# units of the swing.
+# How fast either rod may turn where the motion rests, in units of its fastest before: the root has
+# 1e-12, and grows by no more than the root of 1e16 up to the first of several rests. And how near
+# to an equilibrium a search may end, in units of the swing.
 _SAME = 1e-6
 # Secants for the place of a rest within a step of 0.1 rad: it is then known to 1e-12 of the step.
 _TRIES = 5
@@ -197,7 +235,9 @@ _TRIES = 5
 
 @partial(jax.jit, static_argnames=("symmetry", "error"))
 def _near_guess(pendulum, line, x, log_time, symmetry, error, turn, tolerance, max_iterations):  # type: ignore[no-untyped-def]
-    """The orbit to which Newton's method leads from (x, log of the shooting time), with its minimal period."""
+    """The orbit to which Newton's method leads from (x, log of the shooting time), with its minimal
+    period.
+    """
     fixed, still = lax.stop_gradient((pendulum, line))
     rate = clock(fixed)
     for _ in range(2):  # the rate decides the steps, and the steps what rate is seen
@@ -211,8 +251,12 @@ def _near_guess(pendulum, line, x, log_time, symmetry, error, turn, tolerance, m
     log_time, turns = _minimal(fixed, angles, first.log_time, steps, turns, symmetry)
     reduced = log_time < first.log_time
     settings = Settings(turn, tolerance, jnp.maximum(most - first.iterations, 1), error)
-    newton, steps, change = solve_twice(fixed, still, first.x, log_time, first.shot.rate, turns, symmetry, settings)
-    at_equilibrium = _swing(angles) < _SAME * jnp.minimum(1.0, _swing(still.base + x * still.direction))
+    newton, steps, change = solve_twice(
+        fixed, still, first.x, log_time, first.shot.rate, turns, symmetry, settings
+    )
+    at_equilibrium = _swing(angles) < _SAME * jnp.minimum(
+        1.0, _swing(still.base + x * still.direction)
+    )
     # Many periods of an unstable orbit are too long for Newton's method, and one is not.
     status = jnp.where((first.status == Status.CONVERGED) | reduced, newton.status, first.status)
     status = jnp.where(too_long, Status.BEYOND_HORIZON, status)
@@ -224,12 +268,16 @@ def _near_guess(pendulum, line, x, log_time, symmetry, error, turn, tolerance, m
 
 
 def _swing(angles: Array) -> Scalar:
-    """How far a release is from the nearest equilibrium [rad, up to 1]: the scale of all that is small."""
+    """How far a release is from the nearest equilibrium [rad, up to 1]: the scale of all that is
+    small.
+    """
     return jnp.max(jnp.abs(jnp.sin(angles)))
 
 
 class _Pass(NamedTuple):
-    """Where a search for a rest stands: a step that began at `state` and is tried up to `ahead` [s] from there."""
+    """Where a search for a rest stands: a step that began at `state` and is tried up to `ahead` [s]
+    from there.
+    """
 
     state: State
     slope: Scalar  # of the kinetic energy, at `state`
@@ -243,11 +291,15 @@ class _Pass(NamedTuple):
     found: Scalar
 
 
-def _first_rest(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar) -> tuple[Scalar, State, Scalar]:
-    """The time of the first rest after the release, the state there, and whether there is one before exp(log_time).
+def _first_rest(
+    pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar
+) -> tuple[Scalar, State, Scalar]:
+    """The time of the first rest after the release, the state there, and whether there is one
+    before exp(log_time).
 
-    At a rest the kinetic energy has a minimum, whose place is where its slope vanishes: found by secants from the step
-    in which the slope turns positive. All steps and tries are turns of one loop, each an integration step.
+    At a rest the kinetic energy has a minimum, whose place is where its slope vanishes: found by
+    secants from the step in which the slope turns positive. All steps and tries are turns of one
+    loop, each an integration step.
     """
     duration = jnp.exp(log_time)
     dt = step_size(duration, steps)
@@ -270,7 +322,9 @@ def _first_rest(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scal
         rest = over & jnp.all(rates_of(here) < _SAME * s.fastest)
         onto_next = (~trying & ~seen) | (over & ~rest)
         after, after_slope = jax.tree.map(partial(jnp.where, trying), s.next, (here, slope))
-        last_ahead, last_slope = jax.tree.map(partial(jnp.where, trying), s.before, (jnp.zeros(()), s.slope))
+        last_ahead, last_slope = jax.tree.map(
+            partial(jnp.where, trying), s.before, (jnp.zeros(()), s.slope)
+        )
         secant = s.ahead - slope * (s.ahead - last_ahead) / (slope - last_slope)
         secant = jnp.where(jnp.isfinite(secant), jnp.clip(secant, 0.0, dt), s.ahead)
         keep = partial(jnp.where, onto_next)
@@ -297,14 +351,17 @@ def _first_rest(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scal
 def _minimal(
     pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, turns: Array, symmetry: str
 ) -> tuple[Scalar, Array]:
-    """The log of the shooting time that belongs to a root's minimal period, and the turns at its quarter.
+    """The log of the shooting time that belongs to a root's minimal period, and the turns at its
+    quarter.
 
     The first rest after the release is the orbit's other one, half the minimal period later.
     """
     time, rest, found = _first_rest(pendulum, angles, log_time, steps)
     if symmetry == "centred":
         time = 0.5 * time
-        turns = jnp.where(found, jnp.round((angles + jnp.stack([rest.theta1, rest.theta2])) / (2 * jnp.pi)), turns)
+        turns = jnp.where(
+            found, jnp.round((angles + jnp.stack([rest.theta1, rest.theta2])) / (2 * jnp.pi)), turns
+        )
     covers = jnp.round(jnp.exp(log_time) / jnp.where(found, time, 1.0))
     return jnp.where(found & (covers > 1), jnp.log(jnp.where(found, time, 1.0)), log_time), turns
 
@@ -325,41 +382,50 @@ def find_orbit(
 ) -> PeriodicOrbit:
     """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period.
 
-    Solves theta(T/4) = 0 modulo pi (centred) or p(T/2) = 0 (brake) for (theta2, T) by damped Newton iterations whose
-    Jacobian is forward-mode through the flow. Give one of:
+    Solves theta(T/4) = 0 modulo pi (centred) or p(T/2) = 0 (brake) for (theta2, T) by damped Newton
+    iterations whose Jacobian is forward-mode through the flow. Give one of:
 
-    - `branch`: follow the family of a normal mode by arclength, turning points included, from small swings to the first
-      orbit with |theta1|. An orbit released at (-theta1, -theta2) counts: it is the same one, half a period later.
-    - `guess`: start from (theta2, period) and take what Newton's method finds, reduced to its minimal period.
-    - `ratio` alone: of the orbits with theta2 = ratio theta1 on the in-phase (+1) or anti-phase (-1) branch, or on
-      `branch`, the one nearest to `theta1`, which is then an unknown too; with `guess`, the one near it.
+    - `branch`: follow the family of a normal mode by arclength, turning points included, from small
+      swings to the first orbit with |theta1|. An orbit released at (-theta1, -theta2) counts: it is
+      the same one, half a period later.
+    - `guess`: start from (theta2, period) and take what Newton's method finds, reduced to its
+      minimal period.
+    - `ratio` alone: of the orbits with theta2 = ratio theta1 on the in-phase (+1) or anti-phase
+      (-1) branch, or on `branch`, the one nearest to `theta1`, which is then an unknown too; with
+      `guess`, the one near it.
 
-    Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1` and the pendulum are
-    those of the root itself (implicit function theorem); with `jit`, `vmap` and `grad` all works, and what is wrong
-    with a traced argument shows in `status`.
+    Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
+    and the pendulum are those of the root itself (implicit function theorem); with `jit`, `vmap`
+    and `grad` all works, and what is wrong with a traced argument shows in `status`.
 
     Arguments:
         theta1: release angle of the upper rod [rad].
         branch: `in-phase` (slow mode) or `anti-phase` (fast mode).
         guess: theta2 [rad], period [s].
-        symmetry: with `guess`, `centred` or `brake`. Without it the guess is solved as brake and solved again as
-            centred if the orbit is that; under tracing it stays brake, of which every centred orbit is a case.
+        symmetry: with `guess`, `centred` or `brake`. Without it the guess is solved as brake and
+            solved again as centred if the orbit is that; under tracing it stays brake, of which
+            every centred orbit is a case.
         ratio: +1 or -1.
         crossing: which of the branch's passages through `theta1`, in order of arclength.
-        turn: how far the fastest motion may advance in one integration step [rad]; 0.1 leaves little but rounding.
-        tolerance: on the last Newton update, of theta2 [rad] relative to an amplitude below 1, and of log T. 1e-13 is
-            where rounding begins.
+        turn: how far the fastest motion may advance in one integration step [rad]; 0.1 leaves
+            little but rounding.
+        tolerance: on the last Newton update, of theta2 [rad] relative to an amplitude below 1, and
+            of log T. 1e-13 is where rounding begins.
         max_iterations: Newton iterations at most, at least 1, which is to evaluate the guess.
         error: solve again at half the step for `error_estimate`; without it that is NaN.
     Returns:
-        PeriodicOrbit. If its status is not `Status.CONVERGED` it holds the best iterate and its residual; if the branch
-        does not reach `theta1` (`NO_SUCH_ORBIT`), the orbit where it came closest to upright in theta1.
+        PeriodicOrbit. If its status is not `Status.CONVERGED` it holds the best iterate and its
+        residual; if the branch does not reach `theta1` (`NO_SUCH_ORBIT`), the orbit where it came
+        closest to upright in theta1.
     Raises:
-        ValueError: theta1 not finite; none or more than one of branch and guess; theta1 a multiple of pi with `branch`;
-            both angles at an equilibrium; g not positive; an unknown branch, symmetry or ratio; a period not positive.
+        ValueError: theta1 not finite; none or more than one of branch and guess; theta1 a multiple
+            of pi with `branch`; both angles at an equilibrium; g not positive; an unknown branch,
+            symmetry or ratio; a period not positive.
         RuntimeError: float64 is switched off in JAX.
-    See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009): families of
-        normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159: the quarter period.
+    See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23
+    (2009): families of
+        normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159: the quarter
+        period.
     """
     require_float64()
     theta1, crossing = number("theta1", theta1, unit="rad"), integer("crossing", crossing)
@@ -369,7 +435,9 @@ def find_orbit(
         "turn": number("turn", turn, positive=True, unit="rad"),
         "tolerance": number("tolerance", tolerance, positive=True),
         # This may be traced: it bounds a loop.
-        "max_iterations": max_iterations if is_traced(max_iterations) else integer("max_iterations", max_iterations),
+        "max_iterations": max_iterations
+        if is_traced(max_iterations)
+        else integer("max_iterations", max_iterations),
     }
     for name, value in settings.items():
         single(name, value)
@@ -401,16 +469,23 @@ def _check_request(  # type: ignore[no-untyped-def]
 ) -> None:
     """Refuses what cannot be asked, as far as the values are known before tracing."""
     check_pendulum(pendulum)
-    for name, value, words in (("branch", branch, BRANCHES), ("symmetry", symmetry, RELEASED_SYMMETRIES)):
+    for name, value, words in (
+        ("branch", branch, BRANCHES),
+        ("symmetry", symmetry, RELEASED_SYMMETRIES),
+    ):
         if value is not None:
             one_of(name, value, words)
     if ratio is not None:
         one_of("ratio", ratio, (1, -1))
     at_most_one(branch=branch, guess=guess)
     if branch is None and guess is None and ratio is None:
-        raise ValueError("branch must be given, or guess=(theta2, period), or ratio=1 or -1; got none of them")
+        raise ValueError(
+            "branch must be given, or guess=(theta2, period), or ratio=1 or -1; got none of them"
+        )
     if symmetry is not None and guess is None:
-        raise ValueError(f"symmetry goes with guess, got {symmetry!r} alone: orbits on a branch are centred")
+        raise ValueError(
+            f"symmetry goes with guess, got {symmetry!r} alone: orbits on a branch are centred"
+        )
     if crossing > 1 and (branch is None or ratio is not None):
         raise ValueError(f"crossing must be 1 but with branch alone, got {crossing}: leave it out")
     for name, value in {"theta1": theta1, **vars(pendulum)}.items():
@@ -419,20 +494,29 @@ def _check_request(  # type: ignore[no-untyped-def]
     if angle1 is not None and not math.isfinite(angle1):
         raise ValueError(f"theta1 must be a finite number [rad], got {angle1}: give another theta1")
     if gravity is not None and not gravity > 0:
-        raise ValueError(f"g must be positive for an orbit, got {gravity:g}: nothing swings back without gravity")
+        raise ValueError(
+            f"g must be positive for an orbit, got {gravity:g}: nothing swings back without gravity"
+        )
     if guess is None:
         if angle1 is not None and _multiple_of_pi(angle1):
             raise ValueError(
-                f"theta1 must not be a multiple of 180 degrees on a branch, got {math.degrees(angle1):g} degrees: "
+                f"theta1 must not be a multiple of 180 degrees on a branch, got "
+                f"{math.degrees(angle1):g} degrees: "
                 "the branches pass there only in equilibrium"
             )
         return
     theta2, period = (known_value(value) for value in _guessed(guess))
     if period is not None and not period > 0:
         raise ValueError(f"period must be positive [s], got {period:g}: give another guess")
-    if angle1 is not None and theta2 is not None and _multiple_of_pi(angle1) and _multiple_of_pi(theta2):
+    if (
+        angle1 is not None
+        and theta2 is not None
+        and _multiple_of_pi(angle1)
+        and _multiple_of_pi(theta2)
+    ):
         raise ValueError(
-            f"theta2 must not be a multiple of 180 degrees with theta1 at {math.degrees(angle1):g} degrees, "
+            f"theta2 must not be a multiple of 180 degrees with theta1 at {math.degrees(angle1):g} "
+            f"degrees, "
             f"got {math.degrees(theta2):g} degrees: that is an equilibrium"
         )
 
@@ -442,7 +526,9 @@ def _guessed(guess: Any) -> tuple[Scalar, Scalar]:
     theta2, period = several("guess", guess, "a pair (theta2, period)", 2)
     for name, value in (("theta2", theta2), ("period", period)):
         single(f"guess of {name}", value)
-    return number("guess of theta2", theta2, unit="rad"), number("guess of period", period, unit="s")
+    return number("guess of theta2", theta2, unit="rad"), number(
+        "guess of period", period, unit="s"
+    )
 
 
 def swinging_pendulum(pendulum: Any) -> Pendulum:
@@ -453,7 +539,9 @@ def swinging_pendulum(pendulum: Any) -> Pendulum:
     """
     fixed = known_pendulum(pendulum)
     if not fixed.g > 0:
-        raise ValueError(f"g must be positive for orbits, got {fixed.g:g}: nothing swings back without gravity")
+        raise ValueError(
+            f"g must be positive for orbits, got {fixed.g:g}: nothing swings back without gravity"
+        )
     return fixed
 
 
@@ -464,8 +552,14 @@ def _multiple_of_pi(angle: float) -> bool:
 
 
 def _is_same(one: PeriodicOrbit, other: PeriodicOrbit) -> bool:
-    """Whether two converged orbits are one: angles within 1e-8 rad and periods within 1e-8 of each other."""
-    known = [float(known_value(leaf) or 0.0) for o in (one, other) for leaf in (o.theta1, o.theta2, o.period)]
+    """Whether two converged orbits are one: angles within 1e-8 rad and periods within 1e-8 of each
+    other.
+    """
+    known = [
+        float(known_value(leaf) or 0.0)
+        for o in (one, other)
+        for leaf in (o.theta1, o.theta2, o.period)
+    ]
     apart = max(abs(known[0] - known[3]), abs(known[1] - known[4]))
     longer = abs(known[2] / known[5] - 1)
     return known_value(one.status) == Status.CONVERGED and max(apart, longer) < 1e-8

@@ -1,7 +1,8 @@
-"""Continuation: points of a family, the curve through them, its ends, and arcs for the families that branch off.
+"""Continuation: points of a family, the curve through them, its ends, and arcs for the families
+that branch off.
 
-Between the compiled walk (`walk`) and what users see (`family`). All in natural units and in NumPy: what is done
-here between two calls of compiled code is done once in 32 points.
+Between the compiled walk (`walk`) and what users see (`family`). All in natural units and in NumPy:
+what is done here between two calls of compiled code is done once in 32 points.
 """
 
 import math
@@ -33,13 +34,16 @@ LARGEST_COVER = 6
 _MANY_STEPS = 40
 # Singular values below this share of the largest are zero.
 _NO_RANK = 1e-3
-# How far along the new direction the branch is looked for, and how much further to its side it may be.
+# How far along the new direction the branch is looked for, and how much further to its side it may
+# be.
 _ONTO_BRANCH, _ASTRAY = (0.02, 0.005, 0.05, 0.001), 2.0
 
 
 @dataclass(frozen=True)
 class Reach:
-    """How far a family is followed: the longest step in arclength, the most points, and the longest period."""
+    """How far a family is followed: the longest step in arclength, the most points, and the longest
+    period.
+    """
 
     step: float
     points: int
@@ -49,7 +53,9 @@ class Reach:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Problem:
-    """What is followed: the pendulum as it was given, which may carry derivatives, and the same in natural units."""
+    """What is followed: the pendulum as it was given, which may carry derivatives, and the same in
+    natural units.
+    """
 
     pendulum: Pendulum
     natural: Pendulum = field(metadata={"static": True})
@@ -66,19 +72,32 @@ class Problem:
         for first in range(0, len(points), CHUNK):
             some = slice(first, first + CHUNK)
             count = len(points[some])
-            tasks = Tasks(_padded(points[some]), _padded(rows[some]), _padded(steps[some]).astype(int), np.int64(count))
-            _, table, _, _ = walk(self.natural, begun(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc)
+            tasks = Tasks(
+                _padded(points[some]),
+                _padded(rows[some]),
+                _padded(steps[some]).astype(int),
+                np.int64(count),
+            )
+            _, table, _, _ = walk(
+                self.natural, begun(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc
+            )
             tables.append(np.asarray(table)[:count])
         return unpacked(np.concatenate(tables))
 
-    def followed(self, start: Walk, origin: Corrected | None, reach: Reach) -> tuple[Corrected, str]:
-        """The points after `start`, and what the family's end is; `origin` is the place it could come back to."""
+    def followed(
+        self, start: Walk, origin: Corrected | None, reach: Reach
+    ) -> tuple[Corrected, str]:
+        """The points after `start`, and what the family's end is; `origin` is the place it could
+        come back to.
+        """
         nothing = np.zeros((CHUNK, UNKNOWNS))
         tasks = Tasks(nothing, nothing, nothing[:, 0].astype(int), np.int64(0))
         tables: list[np.ndarray] = []
         count, end, begin = 0, "", start
         while not end and count < reach.points:
-            start, table, more, status = walk(self.natural, start, np.float64(reach.step), tasks, self.arc)
+            start, table, more, status = walk(
+                self.natural, start, np.float64(reach.step), tasks, self.arc
+            )
             tables.append(np.asarray(table)[: int(more)])
             rows, count = unpacked(np.concatenate(tables)), count + int(more)
             end = ("", "ended", "lost")[int(status)]
@@ -102,12 +121,15 @@ class Problem:
         return np.asarray(PARTS[self.symmetry] * rows.times.sum(axis=1))
 
     def _ending_at(self, period: float, begin: Walk, rows: Corrected) -> Corrected:
-        """The rows, the last of which takes longer than `period`, with one of that period in its place; without, if
-        the family was that long from its beginning.
+        """The rows, the last of which takes longer than `period`, with one of that period in its
+        place; without, if the family was that long from its beginning.
         """
         last = curve_of(some_of(rows, slice(-2, None)))
         if len(rows.point) == 1:
-            points, tangents = np.vstack([begin.point, last.points]), np.vstack([begin.tangent, last.tangents])
+            points, tangents = (
+                np.vstack([begin.point, last.points]),
+                np.vstack([begin.tangent, last.tangents]),
+            )
             last = Curve(points, tangents, np.append(last.steps, last.steps))
         place, share = np.zeros(1, int), np.ones(1)
         end = some_of(rows, slice(-1, None))
@@ -120,7 +142,9 @@ class Problem:
         return joined(some_of(rows, slice(-1)), end) if found else some_of(rows, slice(-1))
 
     def on_curve(self, point: np.ndarray) -> Corrected | None:
-        """The point of the family near one that is nearly on it, its tangent not known; None if there is none."""
+        """The point of the family near one that is nearly on it, its tangent not known; None if
+        there is none.
+        """
         row, steps = np.zeros(UNKNOWNS), np.array([_MANY_STEPS])
         row[[0, 1, -2]] = 0.6, 0.4, 1.0  # crosses any curve but by accident
         for _ in range(3):
@@ -131,11 +155,17 @@ class Problem:
         return rows
 
     def onto_branch(self, base: Corrected, point: np.ndarray, sign: float) -> Corrected | None:
-        """The first point of a branch that leaves the family of `base`, from that orbit's own point on this problem;
-        None if nothing is met.
+        """The first point of a branch that leaves the family of `base`, from that orbit's own point
+        on this problem; None if nothing is met.
         """
-        for _ in range(3):  # onto the orbit, by the shortest ways: the equations have rank two less than unknowns here
-            value, jacobian = (np.asarray(x) for x in linearised(self.natural, point, _MANY_STEPS, self.arc))
+        for _ in range(
+            3
+            # onto the orbit, by the shortest ways: the equations have rank two less than unknowns
+            # here
+        ):
+            value, jacobian = (
+                np.asarray(x) for x in linearised(self.natural, point, _MANY_STEPS, self.arc)
+            )
             point = point - np.linalg.pinv(jacobian, rcond=_NO_RANK) @ value
         _, sizes, directions = np.linalg.svd(jacobian)
         if sizes[-1] > _NO_RANK * sizes[0]:
@@ -160,25 +190,37 @@ class Problem:
 
     @property
     def levels(self) -> np.ndarray:
-        """The energies of the equilibria: hanging, with one rod upright, upright. In NumPy: eager JAX would compile."""
+        """The energies of the equilibria: hanging, with one rod upright, upright. In NumPy: eager
+        JAX would compile.
+        """
         upper, lower = float(1 + self.natural.m2), float(self.natural.m2 * self.natural.l2)
         return np.array([-upper - lower, lower - upper, upper - lower, upper + lower])
 
     def _slows(self, rows: Corrected) -> bool:
-        """Whether the time at the end grows like the logarithm of the distance from an equilibrium's energy."""
+        """Whether the time at the end grows like the logarithm of the distance from an
+        equilibrium's energy.
+        """
         gap = np.min(np.abs(rows.energy[-1] - self.levels))
         return bool(abs(rows.time_slope[-1]) * gap > 1e-3 * abs(rows.energy_slope[-1]))
 
     def _near_limit(self, rows: Corrected) -> bool:
-        """Whether a family was lost where rounding, magnified by the inverse distance, keeps it from its end."""
+        """Whether a family was lost where rounding, magnified by the inverse distance, keeps it
+        from its end.
+        """
         gap = np.min(np.abs(rows.energy[-1] - self.levels[1:])) / self.levels[3]
         return bool(gap < NEARLY and abs(rows.energy_slope[-1]) < 1e3 * NEARLY * self.levels[3])
 
     def _back(self, origin: Corrected, rows: Corrected, since: int) -> int | None:
-        """How many points it takes the curve to come back to `origin`, an orbit that it may meet at its other rest."""
+        """How many points it takes the curve to come back to `origin`, an orbit that it may meet at
+        its other rest.
+        """
         curve = curve_of(rows)
         own = release_and_time(origin)[0]
-        other = origin.end[0, :2] if self.symmetry == "brake" else 2 * np.pi * np.asarray(self.turns) - own[:2]
+        other = (
+            origin.end[0, :2]
+            if self.symmetry == "brake"
+            else 2 * np.pi * np.asarray(self.turns) - own[:2]
+        )
         where = release_and_time(rows)
         for i in range(max(since - 1, LEAVING), len(where) - 1):
             chord = where[i + 1] - where[i]
@@ -195,7 +237,9 @@ class Problem:
         for _ in range(4):
             index, shares = np.array([i]), np.array([share])
             tangent = curve.tangents_between(index, shares)
-            rows = self.corrected(curve.between(index, shares), METRIC * tangent, curve.steps[index + 1])
+            rows = self.corrected(
+                curve.between(index, shares), METRIC * tangent, curve.steps[index + 1]
+            )
             apart = way_to(release_and_time(rows)[0], release)
             slope = np.append(rows.tangent[0, :2], rows.time_slope[0] / rows.times[0].sum())
             share += float(apart @ slope / (slope @ slope) / curve.lengths[i])
@@ -218,20 +262,27 @@ def _padded(array: np.ndarray) -> np.ndarray:
     return np.concatenate([array, np.repeat(array[:1], missing, axis=0)])
 
 
-def laid_out(problem: Problem, times: np.ndarray, states: np.ndarray, duration: float) -> np.ndarray:
-    """A point to be corrected for an arc of `duration` on an orbit of which some states are known."""
+def laid_out(
+    problem: Problem, times: np.ndarray, states: np.ndarray, duration: float
+) -> np.ndarray:
+    """A point to be corrected for an arc of `duration` on an orbit of which some states are
+    known.
+    """
     missing = _KNOWN - len(times)
     times = np.append(times, np.full(missing, np.inf))
     states = np.vstack([states, np.zeros((missing, 4))])
     return np.asarray(laid(problem.natural, times, states, duration))
 
 
-# Room for the known states of six periods of a centred orbit, so that the laying of arcs compiles once.
+# Room for the known states of six periods of a centred orbit, so that the laying of arcs compiles
+# once.
 _KNOWN = 4 * SEGMENTS * LARGEST_COVER
 
 
 def _unrolled(problem: Problem, rows: Corrected) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states known on half a period of an orbit: its nodes and, if it is centred, their images about T/4."""
+    """Times and states known on half a period of an orbit: its nodes and, if it is centred, their
+    images about T/4.
+    """
     states = rows.point[0, : 4 * SEGMENTS].reshape(SEGMENTS, 4)
     times = np.concatenate([[0.0], np.cumsum(rows.times[0])])
     if problem.symmetry != "centred":
@@ -248,8 +299,12 @@ def repeated(problem: Problem, rows: Corrected, halves: int) -> tuple[np.ndarray
     all_times, all_states = [times], [states]
     for i in range(1, halves):
         if problem.symmetry == "brake":
-            # Each rest reflects time: the second half is the first, backwards, with the momenta turned round.
-            back = np.append(half, times[:0:-1]), np.vstack([rows.end[0], states[:0:-1]]) * [1, 1, -1, -1]
+            # Each rest reflects time: the second half is the first, backwards, with the momenta
+            # turned round.
+            back = (
+                np.append(half, times[:0:-1]),
+                np.vstack([rows.end[0], states[:0:-1]]) * [1, 1, -1, -1],
+            )
             later = (half - back[0], back[1]) if i % 2 else (times, states)
         else:
             opposite = 2 * np.pi * np.append(problem.turns, [0, 0]) - states

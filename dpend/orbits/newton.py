@@ -1,4 +1,6 @@
-"""Newton's method for periodic orbits: in segments side by side, and in one piece on a line of releases."""
+"""Newton's method for periodic orbits: in segments side by side, and in one piece on a line of
+releases.
+"""
 
 import math
 from functools import partial
@@ -38,13 +40,15 @@ from dpend.orbits.stability import stability_of, transition
 METRIC = np.concatenate([np.tile([1.0, 1.0, 0.0, 0.0], SEGMENTS) / SEGMENTS, [1.0, 0.0]])
 # Newton's update is then below rounding: its error is the square of this.
 _TOLERANCE = 1e-8
-# Where an orbit passes close by an equilibrium on its way, rounding is magnified by the inverse square of the distance:
-# below this an update that does not shrink is noise, and the error estimate tells of it.
+# Where an orbit passes close by an equilibrium on its way, rounding is magnified by the inverse
+# square of the distance: below this an update that does not shrink is noise, and the error estimate
+# tells of it.
 _NOISE = 1e-6
 _MOST_ITERATIONS = 8
-# What rounding leaves of an equation, relative to the coordinates that it is made of: two units in the last place,
-# times the fourth root of m2/m1 where that is above 1.
-# Measured against long double (experiments/orbit_errors.py), which shows the quantiles of estimate over error.
+# What rounding leaves of an equation, relative to the coordinates that it is made of: two units in
+# the last place, times the fourth root of m2/m1 where that is above 1.
+# Measured against long double (experiments/orbit_errors.py), which shows the quantiles of estimate
+# over error.
 _ROUNDINGS = 2.0 * float(np.finfo(np.float64).eps)
 
 
@@ -52,15 +56,16 @@ class Corrected(NamedTuple):
     """A point on a family.
 
     Attributes:
-        point, tangent: the unknowns there, and the unit tangent in the direction of the row it was sought with.
-        side: sign of the bordered Jacobian's determinant: constant along a curve, it changes where another crosses, and
-            on a jump to another one close by.
+        point, tangent: the unknowns there, and the unit tangent in the direction of the row it was
+            sought with.
+        side: sign of the bordered Jacobian's determinant: constant along a curve, it changes where
+            another crosses, and on a jump to another one close by.
         miss, contraction: the first Newton update, and the second over the first.
         steps: how many a segment should have been given.
         converged: whether Newton's method did.
         angle_error: the change of the release on solving at half the step [rad].
-        theta2_error, time_error: of theta2 [rad] and of the time, relative, at this theta1: the change on solving at
-            half the step, and what rounding on the way makes of them.
+        theta2_error, time_error: of theta2 [rad] and of the time, relative, at this theta1: the
+            change on solving at half the step, and what rounding on the way makes of them.
         iterations: of Newton's method.
         residual: of the equations, the largest.
         end: the state at the arc's end.
@@ -126,21 +131,25 @@ class _Newton(NamedTuple):
 def _rounding(pendulum: Pendulum, point: Array, arc: Arc) -> Array:
     """By how much rounding on the way misses each of the equations, the border's included.
 
-    A heavy lower bob makes the rods' inertia nearly singular where they are in line: rounding is then magnified.
+    A heavy lower bob makes the rods' inertia nearly singular where they are in line: rounding is
+    then magnified.
     """
     sizes = jnp.max(jnp.abs(point[:LOG_DELTA].reshape(SEGMENTS, 4)), axis=0)
     none = jnp.zeros(2)
-    ends = jnp.stack([jnp.append(none, sizes[:2]), jnp.append(none, sizes[2:]), sizes])[arc.symmetry]
+    ends = jnp.stack([jnp.append(none, sizes[:2]), jnp.append(none, sizes[2:]), sizes])[
+        arc.symmetry
+    ]
     unit = _ROUNDINGS * jnp.maximum(1.0, pendulum.m2 / pendulum.m1) ** 0.25
     return unit * jnp.concatenate([jnp.tile(sizes, SEGMENTS - 1), ends, none])
 
 
 def _errors(pendulum: Pendulum, n: _Newton, tangent: Array, time: Array, arc: Arc) -> Array:
-    """The errors of theta2 and of the log of the time, whose gradient is `time`, at the point's own theta1.
+    """The errors of theta2 and of the log of the time, whose gradient is `time`, at the point's own
+    theta1.
 
-    The point is off the curve by the last update and by rounding, which the transposed equations carry to what is
-    asked. Where it is off in theta1, the curve's slope tells what the others are off by; at a fold, where that is
-    infinite, its curvature does.
+    The point is off the curve by the last update and by rounding, which the transposed equations
+    carry to what is asked. Where it is off in theta1, the curve's slope tells what the others are
+    off by; at a fold, where that is infinite, its curvature does.
     """
     wanted = jnp.stack([jnp.eye(UNKNOWNS)[0], jnp.eye(UNKNOWNS)[1], time])
     pulled = solve_transposed(n.factors, wanted.T).T * _rounding(pendulum, n.point, arc)
@@ -159,15 +168,19 @@ def _units(pendulum: Pendulum) -> Array:
 
 
 def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: Arc) -> Corrected:
-    """The point of the family in the plane through `predicted` that `row` is normal to, by Newton's method.
+    """The point of the family in the plane through `predicted` that `row` is normal to, by Newton's
+    method.
 
-    The last iteration takes half the step from where the others ended; its update, not made, is the error estimate.
+    The last iteration takes half the step from where the others ended; its update, not made, is the
+    error estimate.
     """
     unit = _units(pendulum)
 
     def iterate(n: _Newton) -> _Newton:
         estimating = n.done == 1
-        equations = shooting_equations(pendulum, n.point, jnp.where(estimating, 2 * steps, steps), arc)
+        equations = shooting_equations(
+            pendulum, n.point, jnp.where(estimating, 2 * steps, steps), arc
+        )
         bordered = jnp.concatenate([equations.jacobian, row[None]])
         short = jnp.append(equations.value, row @ (n.point - predicted))
         factors, pivots, order = lax.linalg.lu(bordered)
@@ -178,14 +191,28 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
         size = jnp.max(jnp.abs(update) / unit)
         iterations = n.iterations + 1
         contraction = jnp.where(iterations == 2, size / n.size, n.contraction)
-        small = (size <= _TOLERANCE) | ((n.iterations > 0) & (size <= _NOISE) & (size > 0.1 * n.size))
-        hopeless = ~(size < 2.0) | ((iterations > 1) & (size > n.size) & ~small) | (iterations >= _MOST_ITERATIONS)
+        small = (size <= _TOLERANCE) | (
+            (n.iterations > 0) & (size <= _NOISE) & (size > 0.1 * n.size)
+        )
+        hopeless = (
+            ~(size < 2.0)
+            | ((iterations > 1) & (size > n.size) & ~small)
+            | (iterations >= _MOST_ITERATIONS)
+        )
         done = jnp.where(estimating, 2, jnp.where(small, 1, jnp.where(hopeless, 3, 0)))
         return _Newton(
-            jnp.where(estimating, n.point, n.point + update), iterations, jnp.where(estimating, n.size, size),
-            jnp.where(n.iterations == 0, size, n.first), contraction, done, update, null, side, equations,
+            jnp.where(estimating, n.point, n.point + update),
+            iterations,
+            jnp.where(estimating, n.size, size),
+            jnp.where(n.iterations == 0, size, n.first),
+            contraction,
+            done,
+            update,
+            null,
+            side,
+            equations,
             (factors, order),
-        )  # fmt: skip
+        )
 
     def running(n: _Newton) -> Scalar:
         return n.done < 2
@@ -196,14 +223,25 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
         jax.eval_shape(shooting_equations, pendulum, predicted, steps, arc),
     )
     start = _Newton(
-        predicted, jnp.asarray(0), jnp.asarray(jnp.inf), zero, zero, jnp.asarray(0), predicted, row, zero, blank,
+        predicted,
+        jnp.asarray(0),
+        jnp.asarray(jnp.inf),
+        zero,
+        zero,
+        jnp.asarray(0),
+        predicted,
+        row,
+        zero,
+        blank,
         (jnp.eye(UNKNOWNS), jnp.zeros(UNKNOWNS, jnp.int32)),
-    )  # fmt: skip
+    )
     n = lax.while_loop(running, iterate, start)
     tangent = n.null / jnp.sqrt(n.null @ (METRIC * n.null))
     s = n.equations.segments
 
-    log_time = jnp.append(s.stretch.ravel() / jnp.sum(s.time), jnp.array([1.0, 0.0]))  # its gradient
+    log_time = jnp.append(
+        s.stretch.ravel() / jnp.sum(s.time), jnp.array([1.0, 0.0])
+    )  # its gradient
     theta2_error, time_error = _errors(pendulum, n, tangent, log_time, arc)
 
     def energy(x: Array) -> Scalar:
@@ -237,13 +275,14 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
 def sensitivities(
     ratios: Array, points: Array, rows: Array, steps: Array, turns: Array, symmetry: str
 ) -> Float[Array, "m 9 3"]:
-    """Derivatives of what is known of orbits at row . point = target, by the implicit function theorem.
+    """Derivatives of what is known of orbits at row . point = target, by the implicit function
+    theorem.
 
     Arguments:
         ratios: l2/l1 and m2/m1.
     Returns:
-        Of the first node, the angles at the end, the arc's time, kappa and log |kappa| (natural units) with respect to
-        the ratios and the target.
+        Of the first node, the angles at the end, the arc's time, kappa and log |kappa| (natural
+        units) with respect to the ratios and the target.
     """
 
     def one(task: tuple) -> Array:
@@ -253,7 +292,9 @@ def sensitivities(
     return lax.map(one, (points, rows, steps))
 
 
-def _sensitivity(ratios: Array, point: Array, row: Array, steps: Scalar, turns: Array, symmetry: str) -> Array:
+def _sensitivity(
+    ratios: Array, point: Array, row: Array, steps: Scalar, turns: Array, symmetry: str
+) -> Array:
     arc = arc_of(symmetry, turns)
 
     def ends(ratios: Array) -> Array:
@@ -274,13 +315,17 @@ def _sensitivity(ratios: Array, point: Array, row: Array, steps: Scalar, turns: 
         last = jnp.stack([end.theta1[-1], end.theta2[-1], jnp.sum(times), kappa, logarithm])
         return jnp.concatenate([point[:4], last])
 
-    jacobian = shooting_equations(Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0), point, steps, arc).jacobian
+    jacobian = shooting_equations(
+        Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0), point, steps, arc
+    ).jacobian
     by_ratios = jax.jacfwd(ends)(ratios)
     right = jnp.zeros((UNKNOWNS, 3)).at[:-1, :2].set(-by_ratios).at[-1, 2].set(1.0)
     moves = jnp.linalg.solve(jnp.concatenate([jacobian, row[None]]), right)
     directions = jnp.concatenate([moves, jnp.eye(2, 3)]).T
     both = jnp.append(point, ratios)
-    return jax.vmap(lambda direction: jax.jvp(known, (both,), (direction,))[1], out_axes=1)(directions)
+    return jax.vmap(lambda direction: jax.jvp(known, (both,), (direction,))[1], out_axes=1)(
+        directions
+    )
 
 
 @jax.jit

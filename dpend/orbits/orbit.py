@@ -1,4 +1,6 @@
-"""`PeriodicOrbit`, and how it is made from a root: units, stability, derivatives by the implicit function theorem."""
+"""`PeriodicOrbit`, and how it is made from a root: units, stability, derivatives by the implicit
+function theorem.
+"""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -35,21 +37,22 @@ class PeriodicOrbit:
         state: at t = 0, at rest; of an odd orbit where theta1 is at an extreme.
         period: the minimal one [s].
         energy: H [J], zero for both bobs at rest at the pivot's height.
-        residual: of the equations solved: angles at T/4 [rad] if centred, else momenta at T/2 in units of
-            m2 l2 sqrt(g l2); the larger of the two. On a family the largest of all its segments' equations, in units of
-            l1, m1 and g.
-        iterations: Newton iterations spent on it, each one integration with its Jacobian and one linear solve; on a
-            branch those of the walk's last step and those at the wanted release.
+        residual: of the equations solved: angles at T/4 [rad] if centred, else momenta at T/2 in
+            units of m2 l2 sqrt(g l2); the larger of the two. On a family the largest of all its
+            segments' equations, in units of l1, m1 and g.
+        iterations: Newton iterations spent on it, each one integration with its Jacobian and one
+            linear solve; on a branch those of the walk's last step and those at the wanted release.
         kappa: half the sum of the two non-trivial Floquet multipliers.
         log_abs_kappa: log |kappa|, natural.
         dual: the state at T/2, the other rest of the orbit.
         turns: theta(T/4)/pi of a centred orbit, two integers; zeros otherwise.
-        error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s], theta1 taken as it is: the change
-            on solving again at half the step, and what the rounding of the motion makes of them; NaN if that was not
-            asked for.
+        error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s], theta1 taken as
+            it is: the change on solving again at half the step, and what the rounding of the motion
+            makes of them; NaN if that was not asked for.
         status: a value of `Status`.
-        symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from rest), or `odd`
-            (x(T/2) = -x(0) up to full turns, never at rest; found by `follow_family`).
+        symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from
+            rest), or `odd` (x(T/2) = -x(0) up to full turns, never at rest; found by
+            `follow_family`).
     """
 
     pendulum: Pendulum
@@ -83,11 +86,15 @@ class PeriodicOrbit:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def implicit_root(symmetry: str, root: Array, parameters: Array, direction: Array, steps: Array) -> Array:
-    """`root` = (x, log of the shooting time), whose value is known already, as a function of the parameters.
+def implicit_root(
+    symmetry: str, root: Array, parameters: Array, direction: Array, steps: Array
+) -> Array:
+    """`root` = (x, log of the shooting time), whose value is known already, as a function of the
+    parameters.
 
-    F(root, parameters) = 0 gives d root = -(dF/d root)^-1 (dF/d parameters) d parameters. Both Jacobians are taken
-    forwards and do not depend on the tangent, so that the rule can be transposed although the flow's loop cannot.
+    F(root, parameters) = 0 gives d root = -(dF/d root)^-1 (dF/d parameters) d parameters. Both
+    Jacobians are taken forwards and do not depend on the tangent, so that the rule can be
+    transposed although the flow's loop cannot.
 
     Arguments:
         parameters: l1, l2, m1, m2, g and the line's base, shape (7,).
@@ -99,7 +106,9 @@ def implicit_root(symmetry: str, root: Array, parameters: Array, direction: Arra
 @implicit_root.defjvp
 def _implicit_root_jvp(symmetry, primals, tangents):  # type: ignore[no-untyped-def]
     _, parameters, direction, steps = primals
-    root = implicit_root(symmetry, *primals)  # by way of this rule, so that second derivatives know how the root moves
+    root = implicit_root(
+        symmetry, *primals
+    )  # by way of this rule, so that second derivatives know how the root moves
 
     def equations(both: Array) -> Array:
         (x, log_time), parameters = both[:2], both[2:]
@@ -115,7 +124,8 @@ def _implicit_root_jvp(symmetry, primals, tangents):  # type: ignore[no-untyped-
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _kappas(symmetry: str, value: Array, orbit: Array, steps: Array) -> Array:
-    """`value` = (kappa, log |kappa|), known from the root's own integration, as a function of the orbit.
+    """`value` = (kappa, log |kappa|), known from the root's own integration, as a function of the
+    orbit.
 
     Arguments:
         orbit: l1, l2, m1, m2, g, theta1, theta2 and the log of the shooting time, shape (8,).
@@ -151,15 +161,21 @@ def orbit_at_root(
     symmetry: str,
     status: Scalar,
 ) -> PeriodicOrbit:
-    """The orbit at a root; `pendulum` and `line` carry derivatives, the root itself has none yet."""
+    """The orbit at a root; `pendulum` and `line` carry derivatives, the root itself has none
+    yet.
+    """
     pack = [jnp.asarray(leaf, jnp.float64) for leaf in jax.tree.leaves(pendulum)]
     steps = steps.astype(jnp.float64)
     root = jnp.stack([newton.x, newton.log_time])
-    x, log_time = implicit_root(symmetry, root, jnp.stack([*pack, *line.base]), line.direction, steps)
+    x, log_time = implicit_root(
+        symmetry, root, jnp.stack([*pack, *line.base]), line.direction, steps
+    )
     theta1, theta2 = line.base + x * line.direction
     state = released(theta1, theta2)
     known = _kappas_of(symmetry, newton.shot.matrix)
-    kappa, log_abs_kappa = _kappas(symmetry, known, jnp.stack([*pack, theta1, theta2, log_time]), steps)
+    kappa, log_abs_kappa = _kappas(
+        symmetry, known, jnp.stack([*pack, theta1, theta2, log_time]), steps
+    )
     if symmetry == "centred":
         dual = released(2 * jnp.pi * turns[0] - theta1, 2 * jnp.pi * turns[1] - theta2)
         residual = jnp.max(jnp.abs(newton.shot.value))
@@ -185,21 +201,31 @@ def orbit_at_root(
 
 @jax.jit
 def slopes(orbit: PeriodicOrbit) -> Float[Array, "4 6"]:
-    """Derivatives of what is known of a centred orbit by the implicit function theorem, without solving it again.
+    """Derivatives of what is known of a centred orbit by the implicit function theorem, without
+    solving it again.
 
     Returns:
         Of theta2, log T, kappa and log |kappa| (rows) with respect to l1, l2, m1, m2, g and theta1.
     """
-    pendulum, theta1, theta2, log_time = orbit.pendulum, orbit.theta1, orbit.theta2, jnp.log(0.25 * orbit.period)
+    pendulum, theta1, theta2, log_time = (
+        orbit.pendulum,
+        orbit.theta1,
+        orbit.theta2,
+        jnp.log(0.25 * orbit.period),
+    )
     line = Line(jnp.stack([theta1, 0.0]), jnp.array([0.0, 1.0]))
-    rate, _ = rate_along(pendulum, line, theta2, log_time, steps_for(log_time, clock(pendulum), FINE))
+    rate, _ = rate_along(
+        pendulum, line, theta2, log_time, steps_for(log_time, clock(pendulum), FINE)
+    )
     steps = steps_for(log_time, rate, FINE).astype(jnp.float64)
     kappas = jnp.stack([orbit.kappa, orbit.log_abs_kappa])
 
     def known(parameters: Array) -> Array:
         base = jnp.append(parameters, 0.0)
         root = implicit_root("centred", jnp.stack([theta2, log_time]), base, line.direction, steps)
-        return jnp.concatenate([root, _kappas("centred", kappas, jnp.concatenate([parameters, root]), steps)])
+        return jnp.concatenate(
+            [root, _kappas("centred", kappas, jnp.concatenate([parameters, root]), steps)]
+        )
 
     return jax.jacfwd(known)(jnp.stack([*jax.tree.leaves(pendulum), theta1]))
 
@@ -212,7 +238,8 @@ def mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
 
 
 class Slopes(NamedTuple):
-    """Derivatives with respect to arclength: finite at folds too, where those with respect to theta1 are not.
+    """Derivatives with respect to arclength: finite at folds too, where those with respect to
+    theta1 are not.
 
     Attributes:
         theta1, theta2: of the release.
@@ -241,20 +268,28 @@ class _Known(NamedTuple):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def implicit_points(symmetry: str, known: Any, parameters: Any, points: Any, rows: Any, steps: Any, turns: Any) -> Any:
-    """`known`, shape (m, 9), as a function of (l2/l1, m2/m1, target), shape (m, 3): see `sensitivities`."""
+def implicit_points(
+    symmetry: str, known: Any, parameters: Any, points: Any, rows: Any, steps: Any, turns: Any
+) -> Any:
+    """`known`, shape (m, 9), as a function of (l2/l1, m2/m1, target), shape (m, 3): see
+    `sensitivities`.
+    """
     return known
 
 
 @jax.custom_jvp
 def _once(parameters: Any) -> Any:
-    """Refuses to be differentiated: the points of `implicit_points` would not know how they move."""
+    """Refuses to be differentiated: the points of `implicit_points` would not know how they
+    move.
+    """
     return parameters
 
 
 @_once.defjvp
 def _once_jvp(primals, tangents):  # type: ignore[no-untyped-def]
-    raise ValueError("theta1 must not be differentiated twice on a family: use find_orbit for second derivatives")
+    raise ValueError(
+        "theta1 must not be differentiated twice on a family: use find_orbit for second derivatives"
+    )
 
 
 @implicit_points.defjvp
@@ -274,12 +309,19 @@ def _carried(pendulum, targets, known, points, rows, steps, turns, symmetry):  #
     return fields | {"energy": hamiltonian(pendulum, fields["state"])}
 
 
-def _in_units(pendulum: Pendulum, known: _Known, turns: Any, symmetry: str, xp: Any) -> dict[str, Any]:
+def _in_units(
+    pendulum: Pendulum, known: _Known, turns: Any, symmetry: str, xp: Any
+) -> dict[str, Any]:
     """The fields of an orbit that depend on the pendulum, but for the energy."""
     second = xp.sqrt(pendulum.l1 / pendulum.g)
     momentum = pendulum.m1 * pendulum.l1**2 / second
     state = State(known.theta1, known.theta2, momentum * known.p1, momentum * known.p2)
-    dual = State(2 * np.pi * turns[0] - known.theta1, 2 * np.pi * turns[1] - known.theta2, -state.p1, -state.p2)
+    dual = State(
+        2 * np.pi * turns[0] - known.theta1,
+        2 * np.pi * turns[1] - known.theta2,
+        -state.p1,
+        -state.p2,
+    )
     if symmetry == "brake":
         dual = State(known.end1, known.end2, dual.p1, dual.p2)
     return {
@@ -292,14 +334,19 @@ def _in_units(pendulum: Pendulum, known: _Known, turns: Any, symmetry: str, xp: 
     }
 
 
-def orbits_of(problem: Problem, rows: Corrected, targets: Any = None, along: Any = None) -> PeriodicOrbit:
+def orbits_of(
+    problem: Problem, rows: Corrected, targets: Any = None, along: Any = None
+) -> PeriodicOrbit:
     """Points as orbits, in NumPy: eager JAX would compile each operation for each number of points.
 
-    With `targets`, the values of theta1 at which the rows `along` were solved, everything carries derivatives.
+    With `targets`, the values of theta1 at which the rows `along` were solved, everything carries
+    derivatives.
     """
     _, kappa, logarithm = stability_of(rows.matrices, problem.symmetry)
     time = rows.times.sum(axis=1)
-    start = rows.point[:, :4] * ([1, 1, 1, 1] if problem.symmetry == "odd" else [1, 1, 0, 0])  # at rest, exactly
+    start = rows.point[:, :4] * (
+        [1, 1, 1, 1] if problem.symmetry == "odd" else [1, 1, 0, 0]
+    )  # at rest, exactly
     known = np.column_stack([start, rows.end[:, :2], time, kappa, logarithm])
     turns = np.asarray(problem.turns)
     pendulum = jax.tree.map(known_value, problem.pendulum)
@@ -309,7 +356,9 @@ def orbits_of(problem: Problem, rows: Corrected, targets: Any = None, along: Any
     else:
         task = known, rows.point, along, rows.steps, turns
         fields = _carried(problem.pendulum, targets, *task, problem.symmetry)
-    whole = np.broadcast_to(turns if problem.symmetry == "centred" else 0 * turns, (len(time), 2)).astype(int)
+    whole = np.broadcast_to(
+        turns if problem.symmetry == "centred" else 0 * turns, (len(time), 2)
+    ).astype(int)
     period = PARTS[problem.symmetry] * math.sqrt(pendulum.l1 / pendulum.g) * time
     return PeriodicOrbit(
         **fields,

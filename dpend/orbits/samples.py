@@ -1,4 +1,6 @@
-"""Samples of a family with the test functions that vanish at its special points, and their errors."""
+"""Samples of a family with the test functions that vanish at its special points, and their
+errors.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,16 +33,17 @@ class SpecialPoint:
     """A place on a family where something changes.
 
     Attributes:
-        kind: `stability_lost` or `stability_gained` on the way along the family; `fold_theta1`, `fold_energy`, where
-            the curve turns back in it; `resonance_k:n`, where the multipliers are exp(+-2 pi i n/k) and orbits of k
-            times the period branch off; `crossing`, where another curve runs through this one, or passes it by less
-            than 2e-4. Of what lies within its error only folds and changes of stability are told, if they are not
-            taken back there.
+        kind: `stability_lost` or `stability_gained` on the way along the family; `fold_theta1`,
+            `fold_energy`, where the curve turns back in it; `resonance_k:n`, where the multipliers
+            are exp(+-2 pi i n/k) and orbits of k times the period branch off; `crossing`, where
+            another curve runs through this one, or passes it by less than 2e-4. Of what lies within
+            its error only folds and changes of stability are told, if they are not taken back
+            there.
         arclength: where, in the family's.
         orbit: the orbit there.
         slopes: derivatives with respect to arclength.
-        error_estimate: of arclength, and of the orbit's kappa. Rounding cannot hide on which side of the point a place
-            further away lies; kappa is within its error of what the kind says.
+        error_estimate: of arclength, and of the orbit's kappa. Rounding cannot hide on which side
+            of the point a place further away lies; kappa is within its error of what the kind says.
     """
 
     arclength: Scalar
@@ -57,7 +60,9 @@ class Test(NamedTuple):
 
     kind: str
     value: Callable[[Corrected, np.ndarray], np.ndarray]
-    branch: tuple[str, int] | None  # symmetry of the orbits that branch off, and their period in units of this one's
+    branch: (
+        tuple[str, int] | None
+    )  # symmetry of the orbits that branch off, and their period in units of this one's
 
 
 def test_functions(symmetry: str) -> list[Test]:
@@ -66,7 +71,11 @@ def test_functions(symmetry: str) -> list[Test]:
         Test("fold_theta1", lambda rows, c: rows.tangent[:, 0], None),
         Test("fold_energy", lambda rows, c: rows.energy_slope, None),
     ]
-    branches = {"centred": (("odd", 1), ("brake", 1)), "brake": (None, ("brake", 2)), "odd": (None, None)}[symmetry]
+    branches = {
+        "centred": (("odd", 1), ("brake", 1)),
+        "brake": (None, ("brake", 2)),
+        "odd": (None, None),
+    }[symmetry]
     tests.append(Test("above", lambda rows, c: c - 1, branches[0]))
     tests.append(Test("below", lambda rows, c: c + 1, branches[1]))
     for k in range(2, LARGEST_COVER + 1):
@@ -76,7 +85,9 @@ def test_functions(symmetry: str) -> list[Test]:
             target = math.cos((2 if symmetry == "brake" else 1) * math.pi * n / k)
             branch = "centred" if symmetry == "centred" and n % 2 == 0 else "brake"
             value = partial(lambda target, rows, c: c - target, target)
-            tests.append(Test(f"resonance_{k}:{n}", value, (branch, k) if symmetry != "odd" else None))
+            tests.append(
+                Test(f"resonance_{k}:{n}", value, (branch, k) if symmetry != "odd" else None)
+            )
     return tests
 
 
@@ -86,19 +97,24 @@ def measure_of(rows: Corrected, symmetry: str) -> np.ndarray:
     return np.asarray(kappa if symmetry == "brake" else c)
 
 
-# What rounding leaves of c and of slopes, as bounds. About 306 places of 60 families, c scattered by 7 (median) to 1400
-# times eps times its growth, and the tangent by up to 10 times the error estimate of the point.
+# What rounding leaves of c and of slopes, as bounds. About 306 places of 60 families, c scattered
+# by 7 (median) to 1400 times eps times its growth, and the tangent by up to 10 times the error
+# estimate of the point.
 _ROUNDING, _LEVERAGE, _WOBBLE = 2000 * np.finfo(float).eps, 4.0, 50.0
 
 
 def measure_error(rows: Corrected, symmetry: str) -> np.ndarray:
     """What c, of brake orbits kappa, is known to."""
     spread = np.maximum(rows.angle_error, rows.time_error)
-    return np.asarray(growth_of(rows.matrices, symmetry) * np.maximum(_ROUNDING, _LEVERAGE * spread))
+    return np.asarray(
+        growth_of(rows.matrices, symmetry) * np.maximum(_ROUNDING, _LEVERAGE * spread)
+    )
 
 
 def kappa_error(spot: "Spot", symmetry: str) -> float:
-    """What the kappa of a special point is known to: rounding, and what its place's error makes of it."""
+    """What the kappa of a special point is known to: rounding, and what its place's error makes of
+    it.
+    """
     error = float(measure_error(spot.row, symmetry)[0] + abs(spot.steepness) * spot.error)
     if symmetry == "brake":
         return error
@@ -107,7 +123,9 @@ def kappa_error(spot: "Spot", symmetry: str) -> float:
     return 4 * c * error + 2 * error**2 + np.finfo(float).eps * (1 + 2 * c**2)
 
 
-def values_of_tests(tests: Sequence[Test], problem: Problem, rows: Corrected) -> tuple[np.ndarray, np.ndarray]:
+def values_of_tests(
+    tests: Sequence[Test], problem: Problem, rows: Corrected
+) -> tuple[np.ndarray, np.ndarray]:
     """Of each test at each point, shape (tests, points): the value, and what it is known to."""
     measure, error = measure_of(rows, problem.symmetry), measure_error(rows, problem.symmetry)
     eps = np.finfo(float).eps
@@ -118,7 +136,9 @@ def values_of_tests(tests: Sequence[Test], problem: Problem, rows: Corrected) ->
 
 
 def _steepness(problem: Problem, rows: Corrected) -> np.ndarray:
-    """The size of the energy's gradient at the release, which multiplies the tangent's error; a bound if it moves."""
+    """The size of the energy's gradient at the release, which multiplies the tangent's error; a
+    bound if it moves.
+    """
     if problem.symmetry == "odd":
         return np.full(len(rows.point), problem.levels[3])
     weights = np.array([1 + problem.natural.m2, problem.natural.m2 * problem.natural.l2])
@@ -142,19 +162,25 @@ class Track:
 
     def rows_at(self, where: np.ndarray, near: Corrected | None = None) -> Corrected:
         """The points there: from the curve's cubics, or from points close by."""
-        index = np.clip(np.searchsorted(self.arclength, where, side="right") - 1, 0, len(self.arclength) - 2)
-        share = (where - self.arclength[index]) / (self.arclength[index + 1] - self.arclength[index])
+        index = np.clip(
+            np.searchsorted(self.arclength, where, side="right") - 1, 0, len(self.arclength) - 2
+        )
+        share = (where - self.arclength[index]) / (
+            self.arclength[index + 1] - self.arclength[index]
+        )
         points, steps = self.curve.between(index, share), self.curve.steps[index + 1]
         normals = METRIC * self.curve.tangents_between(index, share)
         if near is not None:  # along its tangent into the new plane
-            way = np.sum(normals * (points - near.point), axis=1) / np.sum(normals * near.tangent, axis=1)
+            way = np.sum(normals * (points - near.point), axis=1) / np.sum(
+                normals * near.tangent, axis=1
+            )
             points, steps = near.point + way[:, None] * near.tangent, near.steps
         return self.problem.corrected(points, normals, steps)
 
 
 class Spot(NamedTuple):
-    """A special point to be: its kind, arclength, what that is known to, the row, the slope of c (of brake orbits
-    kappa) with arclength, and what branches off.
+    """A special point to be: its kind, arclength, what that is known to, the row, the slope of c
+    (of brake orbits kappa) with arclength, and what branches off.
     """
 
     kind: str

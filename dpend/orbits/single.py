@@ -1,4 +1,6 @@
-"""Single shooting: an orbit released from rest in one piece, by Newton's method on a line of releases."""
+"""Single shooting: an orbit released from rest in one piece, by Newton's method on a line of
+releases.
+"""
 
 import sys
 from functools import partial
@@ -19,11 +21,12 @@ from dpend.status import Status
 RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
 # No number is better known than this, relative to itself.
 _LAST_BIT = sys.float_info.epsilon
-# How many units in the last place of its coordinates, times sqrt(1 + m2/m1), the rounding of a step amounts to.
-# Measured against long double (experiments/orbit_errors.py), which shows the quantiles of estimate over error.
+# How many units in the last place of its coordinates, times sqrt(1 + m2/m1), the rounding of a step
+# amounts to. Measured against long double (experiments/orbit_errors.py), which shows the quantiles
+# of estimate over error.
 _ROUNDINGS = 2.0
-# A state on the way whose rounding was a displacement of the start by more than so many units in the last place no
-# longer matters to where the root is, and its square would drown what does.
+# A state on the way whose rounding was a displacement of the start by more than so many units in
+# the last place no longer matters to where the root is, and its square would drown what does.
 _FORGOTTEN = 1e5
 # rate times step [rad]: leaves errors of rounding in theta2 and T.
 FINE = 0.1
@@ -39,10 +42,12 @@ class Line(NamedTuple):
 
 
 class _Shot(NamedTuple):
-    """The equations at one point: their value, and the Jacobian in (theta1, theta2, log of the shooting time).
+    """The equations at one point: their value, and the Jacobian in (theta1, theta2, log of the
+    shooting time).
 
-    `by_start` is the derivative of the value with respect to the whole first state, momenta included; `rounding` is the
-    covariance of that state which does to the end what a unit in the last place of every state on the way does.
+    `by_start` is the derivative of the value with respect to the whole first state, momenta
+    included; `rounding` is the covariance of that state which does to the end what a unit in the
+    last place of every state on the way does.
     """
 
     value: Float[Array, "2"]
@@ -64,14 +69,19 @@ def _momentum_unit(pendulum: Pendulum) -> Scalar:
 
 
 def steps_for(log_time: Scalar, rate: Scalar, turn: Scalar) -> Scalar:
-    """How many steps a shooting time takes if the fastest motion may advance by `turn` [rad] in each."""
+    """How many steps a shooting time takes if the fastest motion may advance by `turn` [rad] in
+    each.
+    """
     wanted = jnp.ceil(jnp.exp(log_time) * rate / turn)
     return jnp.clip(jnp.nan_to_num(wanted, nan=8.0), 8, MOST_STEPS_IN_ONE_PIECE).astype(int)
 
 
 @partial(jax.jit, static_argnames="symmetry")  # traced once for the walk and for Newton's method
-def _shoot(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, symmetry: str, turns: Array) -> _Shot:
-    """The equations of `symmetry` for a release at `angles`, after a time exp(log_time) in `steps` steps.
+def _shoot(
+    pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, symmetry: str, turns: Array
+) -> _Shot:
+    """The equations of `symmetry` for a release at `angles`, after a time exp(log_time) in `steps`
+    steps.
 
     The brake equations are divided by the time: p(t) = 0 has the root t = 0, and p(t)/t has not.
     """
@@ -82,7 +92,9 @@ def _shoot(pendulum: Pendulum, angles: Array, log_time: Scalar, steps: Scalar, s
         state, tangents = RK8.advance_tangents(pendulum, carry[0], carry[1], dt)
         back = _inverse(tangents) * (_LAST_BIT * jnp.stack(jax.tree.leaves(state)))
         back = jnp.where(jnp.max(jnp.abs(back[:2])) < _FORGOTTEN * _LAST_BIT, back, 0.0)
-        rounding = carry[3] + jnp.sum(back[:, None, :] * back[None, :, :], axis=2)  # fuses, and a product does not
+        rounding = carry[3] + jnp.sum(
+            back[:, None, :] * back[None, :, :], axis=2
+        )  # fuses, and a product does not
         return state, tangents, jnp.fmax(carry[2], fastest(pendulum, state)), rounding
 
     start = (state, State(*jnp.eye(4)), fastest(pendulum, state), jnp.zeros((4, 4)))
@@ -110,7 +122,8 @@ def _inverse(tangents: State) -> Float[Array, "4 4"]:
 # The largest update of x [rad] and of log T in one iteration.
 _LARGEST_UPDATE = 0.5
 _LEAST_DAMPING = 2.0**-12
-# An update this small that is not shortened by this much damping is noise; the error estimate says how much.
+# An update this small that is not shortened by this much damping is noise; the error estimate says
+# how much.
 _SMALL_UPDATE, _STALLED = 1e-6, 2.0**-4
 
 
@@ -126,7 +139,9 @@ class LineNewton(NamedTuple):
 
 
 def _newton_update(line: Line, jacobian: Array, value: Array) -> Array:
-    """The change of (x, log of the shooting time) that the linear equations ask for; `value` may have columns."""
+    """The change of (x, log of the shooting time) that the linear equations ask for; `value` may
+    have columns.
+    """
     square = jnp.column_stack([jacobian[:, :2] @ line.direction, jacobian[:, 2]])
     determinant = square[0, 0] * square[1, 1] - square[0, 1] * square[1, 0]
     adjugate = jnp.array([[square[1, 1], -square[0, 1]], [-square[1, 0], square[0, 0]]])
@@ -136,8 +151,8 @@ def _newton_update(line: Line, jacobian: Array, value: Array) -> Array:
 def _rounding(pendulum: Pendulum, line: Line, shot: _Shot) -> Float[Array, "2"]:
     """What rounding on the way makes of (x, log of the shooting time).
 
-    Each step's is independent of the others' and grows as the motion does from there; the root takes their sum as it
-    takes any change of the equations.
+    Each step's is independent of the others' and grows as the motion does from there; the root
+    takes their sum as it takes any change of the equations.
     """
     by_start = _newton_update(line, shot.jacobian, shot.by_start)
     return (
@@ -148,14 +163,23 @@ def _rounding(pendulum: Pendulum, line: Line, shot: _Shot) -> Float[Array, "2"]:
 
 
 def newton_on_line(
-    pendulum: Pendulum, line: Line, x: Scalar, log_time: Scalar, steps: Scalar, turns: Array, symmetry: str,
-    tolerance: Scalar, max_iterations: Scalar,
-) -> LineNewton:  # fmt: skip
-    """Damped Newton for (x, log of the shooting time), the step count held fixed so that the equations are smooth.
+    pendulum: Pendulum,
+    line: Line,
+    x: Scalar,
+    log_time: Scalar,
+    steps: Scalar,
+    turns: Array,
+    symmetry: str,
+    tolerance: Scalar,
+    max_iterations: Scalar,
+) -> LineNewton:
+    """Damped Newton for (x, log of the shooting time), the step count held fixed so that the
+    equations are smooth.
 
-    An update is halved until the next one, taken with the same Jacobian, is shorter: Deuflhard's natural monotonicity
-    test, which does not depend on the conditioning of the equations. It has converged when the next update is below
-    `tolerance` (relative to the amplitude, at most 1), or is small and no damping shortens it: that is rounding.
+    An update is halved until the next one, taken with the same Jacobian, is shorter: Deuflhard's
+    natural monotonicity test, which does not depend on the conditioning of the equations. It has
+    converged when the next update is below `tolerance` (relative to the amplitude, at most 1), or
+    is small and no damping shortens it: that is rounding.
     """
 
     def shoot(x: Scalar, log_time: Scalar) -> _Shot:
@@ -169,7 +193,9 @@ def newton_on_line(
         amplitude = jnp.minimum(1.0, jnp.max(jnp.abs(line.base + trial[0] * line.direction)))
         unit = jnp.stack([amplitude, 1.0])
         same_jacobian = jnp.max(jnp.abs(newton_update(s.shot.jacobian, shot.value)) / unit)
-        better = jnp.where(jnp.isinf(s.size), jnp.all(jnp.isfinite(shot.jacobian)), same_jacobian < s.size)
+        better = jnp.where(
+            jnp.isinf(s.size), jnp.all(jnp.isfinite(shot.jacobian)), same_jacobian < s.size
+        )
         stalled = ~better & (s.size <= _SMALL_UPDATE) & (s.damping <= _STALLED)
         update = newton_update(shot.jacobian, shot.value)
         size = jnp.max(jnp.abs(update) / unit)
@@ -197,15 +223,25 @@ def newton_on_line(
     nan = jnp.asarray(jnp.nan)
     blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, nan), jax.eval_shape(shoot, x, log_time))
     start = LineNewton(
-        x, log_time, jnp.asarray(jnp.inf), blank, jnp.zeros(2), jnp.asarray(1.0), jnp.asarray(0), jnp.asarray(RUNNING)
+        x,
+        log_time,
+        jnp.asarray(jnp.inf),
+        blank,
+        jnp.zeros(2),
+        jnp.asarray(1.0),
+        jnp.asarray(0),
+        jnp.asarray(RUNNING),
     )
-    end = lax.while_loop(lambda s: (s.status == RUNNING) & (s.iterations < max_iterations), iterate, start)
+    end = lax.while_loop(
+        lambda s: (s.status == RUNNING) & (s.iterations < max_iterations), iterate, start
+    )
     status = jnp.where(end.status == RUNNING, Status.MAX_ITERATIONS, end.status)
     return end._replace(status=jnp.where(jnp.isfinite(end.size), status, Status.NONFINITE))
 
 
 RUNNING = -1
-# No brake orbit has a shooting time this short in units of the fast mode [rad]: the search ran into T = 0.
+# No brake orbit has a shooting time this short in units of the fast mode [rad]: the search ran into
+# T = 0.
 _SHORTEST = 0.02
 
 
@@ -219,12 +255,23 @@ def solve_twice(
     symmetry: str,
     settings: "Settings",
 ) -> tuple[LineNewton, Scalar, Array]:
-    """Newton's root from a close guess, the number of steps it used, and the change of (x, T) at half the step."""
+    """Newton's root from a close guess, the number of steps it used, and the change of (x, T) at
+    half the step.
+    """
     steps = steps_for(log_time, rate, settings.turn)
 
-    def level(carry: tuple[Scalar, Scalar], factor: Scalar) -> tuple[tuple[Scalar, Scalar], LineNewton]:
+    def level(
+        carry: tuple[Scalar, Scalar], factor: Scalar
+    ) -> tuple[tuple[Scalar, Scalar], LineNewton]:
         newton = newton_on_line(
-            pendulum, line, *carry, factor * steps, turns, symmetry, settings.tolerance, settings.max_iterations
+            pendulum,
+            line,
+            *carry,
+            factor * steps,
+            turns,
+            symmetry,
+            settings.tolerance,
+            settings.max_iterations,
         )
         return (newton.x, newton.log_time), newton
 
@@ -233,10 +280,13 @@ def solve_twice(
     newton = jax.tree.map(lambda leaf: leaf[0], both)
     change = jnp.full(2, jnp.nan)
     if settings.error:
-        # With the finer root's last update, too small to be made: a change below the tolerance would read zero.
+        # With the finer root's last update, too small to be made: a change below the tolerance
+        # would read zero.
         x, log_time = both.x[1] + both.update[1, 0], both.log_time[1] + both.update[1, 1]
         period = PARTS[symmetry] * jnp.exp(newton.log_time)
-        change = jnp.stack([jnp.abs(x - newton.x), period * jnp.abs(jnp.expm1(log_time - newton.log_time))])
+        change = jnp.stack(
+            [jnp.abs(x - newton.x), period * jnp.abs(jnp.expm1(log_time - newton.log_time))]
+        )
         change = change + _rounding(pendulum, line, newton.shot) * jnp.stack([1.0, period])
         change = jnp.where(both.status[1] == Status.CONVERGED, change, jnp.nan)
     return newton, steps, change
@@ -251,7 +301,9 @@ class Settings(NamedTuple):
     error: bool
 
 
-def rate_along(pendulum: Pendulum, line: Line, x: Scalar, log_time: Scalar, steps: Scalar) -> tuple[Scalar, Array]:
+def rate_along(
+    pendulum: Pendulum, line: Line, x: Scalar, log_time: Scalar, steps: Scalar
+) -> tuple[Scalar, Array]:
     """The largest rate on the way, and the angles at the end."""
     state = released(*(line.base + x * line.direction))
 

@@ -1,4 +1,6 @@
-"""Special points of a family: where stability changes, where it turns back, and where others branch off."""
+"""Special points of a family: where stability changes, where it turns back, and where others branch
+off.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,15 +29,20 @@ from dpend.orbits.samples import (
 from dpend.orbits.walk import CROSSING
 
 
-def special_points(problem: Problem, rows: Corrected, curve: Curve, arclength: np.ndarray) -> list[SpecialPoint]:
-    """Every place where another curve crosses, and every place where a test changes its sign by more than its error."""
+def special_points(
+    problem: Problem, rows: Corrected, curve: Curve, arclength: np.ndarray
+) -> list[SpecialPoint]:
+    """Every place where another curve crosses, and every place where a test changes its sign by
+    more than its error.
+    """
     track = Track(problem, curve, arclength)
     samples = Samples(arclength[len(arclength) - len(rows.point) :], rows)
     zones = crossings(track, samples)
     samples = outside(zones, _with_extrema(track, outside(zones, samples, with_ends=True)))
     changes = _changes(problem, samples)
     places = [
-        Spot("crossing", z.place, CROSSING, z.row_at(problem, z.place), z.steepness(problem), None) for z in zones
+        Spot("crossing", z.place, CROSSING, z.row_at(problem, z.place), z.steepness(problem), None)
+        for z in zones
     ]
     if changes:
         places += _told(changes, _located(track, changes, zones), places, samples.where, problem)
@@ -47,12 +54,16 @@ _VERTICES = 5
 
 
 def _with_extrema(track: Track, samples: Samples) -> Samples:
-    """The samples, and more about every extremum between them that may reach beyond a value that is tested: two changes
-    of sign within a step would else not be seen.
+    """The samples, and more about every extremum between them that may reach beyond a value that is
+    tested: two changes of sign within a step would else not be seen.
     """
     symmetry = track.problem.symmetry
     measure = measure_of(samples.rows, symmetry)
-    ranged = [test for test in test_functions(symmetry) if test.kind.startswith(("above", "below", "resonance"))]
+    ranged = [
+        test
+        for test in test_functions(symmetry)
+        if test.kind.startswith(("above", "below", "resonance"))
+    ]
     levels = np.arcsinh([-float(test.value(samples.rows, 0 * measure)[0]) for test in ranged])
     triples = []
     for function, targets in (
@@ -65,9 +76,13 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
         highest, lowest = (here >= before) & (here >= after), (here <= before) & (here <= after)
         sense = np.where(highest, 1.0, np.where(lowest, -1.0, 0.0))
         (near,) = np.nonzero(
-            (sense != 0) & (_in_reach(h, sense, targets) | _in_reach(np.sinh(h), sense, np.sinh(targets)))
+            (sense != 0)
+            & (_in_reach(h, sense, targets) | _in_reach(np.sinh(h), sense, np.sinh(targets)))
         )
-        triples += [(function, samples.where[i : i + 3].copy(), h[i : i + 3] * sense[i], sense[i]) for i in near]
+        triples += [
+            (function, samples.where[i : i + 3].copy(), h[i : i + 3] * sense[i], sense[i])
+            for i in near
+        ]
     more = []
     for _ in range(_VERTICES if triples else 0):
         spots = np.array([_vertex(place, height) for _, place, height, _ in triples])
@@ -79,9 +94,11 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
 
 
 def _in_reach(h: np.ndarray, sense: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Of points between two others, the highest or lowest of the three: whether the function may get to a target.
+    """Of points between two others, the highest or lowest of the three: whether the function may
+    get to a target.
 
-    A parabola's vertex lies beyond the highest of three even points by an eighth of their range at most.
+    A parabola's vertex lies beyond the highest of three even points by an eighth of their range at
+    most.
     """
     before, here, after = h[:-2], h[1:-1], h[2:]
     with np.errstate(invalid="ignore"):  # beyond any float
@@ -91,7 +108,9 @@ def _in_reach(h: np.ndarray, sense: np.ndarray, targets: np.ndarray) -> np.ndarr
 
 
 def _vertex(place: np.ndarray, height: np.ndarray) -> float:
-    """Where the parabola through three points, the middle one the highest, is highest; not on one of them."""
+    """Where the parabola through three points, the middle one the highest, is highest; not on one
+    of them.
+    """
     left, right = place[1] - place[0], place[2] - place[1]
     fall_left, fall_right = (height[1] - height[0]) / left, (height[1] - height[2]) / right
     total = fall_left + fall_right
@@ -107,7 +126,10 @@ def _narrow(place: np.ndarray, height: np.ndarray, spot: float, top: float) -> N
     heights = np.append(height, top)
     order = np.argsort(points)
     middle = int(np.clip(np.argmax(heights[order]), 1, 2))
-    place[:], height[:] = points[order][middle - 1 : middle + 2], heights[order][middle - 1 : middle + 2]
+    place[:], height[:] = (
+        points[order][middle - 1 : middle + 2],
+        heights[order][middle - 1 : middle + 2],
+    )
 
 
 class _Change(NamedTuple):
@@ -123,7 +145,9 @@ class _Change(NamedTuple):
 def _changes(problem: Problem, samples: Samples) -> list[_Change]:
     tests = test_functions(problem.symmetry)
     changes = []
-    for test, value, error in zip(tests, *values_of_tests(tests, problem, samples.rows), strict=True):
+    for test, value, error in zip(
+        tests, *values_of_tests(tests, problem, samples.rows), strict=True
+    ):
         (certain,) = np.nonzero((np.abs(value) > error) & (samples.rows.converged > 0))
         (turns,) = np.nonzero((value[certain][:-1] < 0) != (value[certain][1:] < 0))
         for i, j in zip(certain[turns], certain[turns + 1], strict=True):
@@ -132,8 +156,12 @@ def _changes(problem: Problem, samples: Samples) -> list[_Change]:
 
 
 def _located(track: Track, changes: Sequence[_Change], zones: Sequence[Zone]) -> list[Spot]:
-    """Where the tests vanish; across a zone, by the secant through values that the other curve does not disturb."""
-    across = [next((z for z in zones if z.holds(change.low, change.high)), None) for change in changes]
+    """Where the tests vanish; across a zone, by the secant through values that the other curve does
+    not disturb.
+    """
+    across = [
+        next((z for z in zones if z.holds(change.low, change.high)), None) for change in changes
+    ]
     solved = [i for i, zone in enumerate(across) if zone is None]
     spots: list[Spot] = []
     if solved:
@@ -156,13 +184,15 @@ def _located(track: Track, changes: Sequence[_Change], zones: Sequence[Zone]) ->
     return spots
 
 
-# A root is located when the value is below this share of its error, or below its error and the step below the second
-# [arclength], or when there are no numbers between.
+# A root is located when the value is below this share of its error, or below its error and the step
+# below the second [arclength], or when there are no numbers between.
 _ENOUGH, _LOCATED = 0.1, 1e-12
 _ROUNDS = 60
 
 
-def _own_values(track: Track, changes: Sequence[_Change], rows: Corrected) -> tuple[np.ndarray, np.ndarray]:
+def _own_values(
+    track: Track, changes: Sequence[_Change], rows: Corrected
+) -> tuple[np.ndarray, np.ndarray]:
     """Of each change its test at its own point: the value, and what it is known to."""
     values, errors = values_of_tests([change.test for change in changes], track.problem, rows)
     return np.diagonal(values).copy(), np.diagonal(errors).copy()
@@ -171,11 +201,13 @@ def _own_values(track: Track, changes: Sequence[_Change], rows: Corrected) -> tu
 def _roots(track: Track, changes: Sequence[_Change]) -> tuple[np.ndarray, Corrected]:
     """Where the tests vanish, and the rows there.
 
-    Newton's method on the family's equations together with the test's: each point is corrected onto the curve, and the
-    step along it is the secant's, kept inside its bracket (Illinois).
+    Newton's method on the family's equations together with the test's: each point is corrected onto
+    the curve, and the step along it is the secant's, kept inside its bracket (Illinois).
     """
     low, high, at_low, at_high = (np.array([change[k] for change in changes]) for k in (1, 2, 3, 4))
-    where, value, error, last = (np.full(len(changes), start) for start in (np.inf, np.inf, 0.0, 0.0))
+    where, value, error, last = (
+        np.full(len(changes), start) for start in (np.inf, np.inf, 0.0, 0.0)
+    )
     positive = at_low > 0
     going = np.arange(len(changes))
     rows: Corrected | None = None
@@ -221,7 +253,9 @@ _WIDER = 10.0
 def _location_errors(
     track: Track, changes: Sequence[_Change], where: np.ndarray, rows: Corrected
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far from a root its test's sign is certain, on both sides, by looking; and the slope of c between."""
+    """How far from a root its test's sign is certain, on both sides, by looking; and the slope of c
+    between.
+    """
     low, high, at_low, at_high = (np.array([change[k] for change in changes]) for k in (1, 2, 3, 4))
     _, error = _own_values(track, changes, rows)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -243,24 +277,39 @@ def _location_errors(
     return np.minimum(width, np.maximum(where - low, high - where)), slope
 
 
-# c, of brake orbits kappa, is known to this where a resonance, or a window of stability between two points, is told.
+# c, of brake orbits kappa, is known to this where a resonance, or a window of stability between two
+# points, is told.
 _KNOWN = 1e-4
 
 
 def _told(
-    changes: Sequence[_Change], spots: Sequence[Spot], crossings: Sequence[Spot], where: np.ndarray, problem: Problem
+    changes: Sequence[_Change],
+    spots: Sequence[Spot],
+    crossings: Sequence[Spot],
+    where: np.ndarray,
+    problem: Problem,
 ) -> list[Spot]:
-    """The special points: what is too near to a crossing to be told from it is not, but for a change that lasts."""
+    """The special points: what is too near to a crossing to be told from it is not, but for a
+    change that lasts.
+    """
     told, bounds = [], []
     folds = [spot for spot in spots if spot.kind == "fold_energy"]
     for change, spot in zip(changes, spots, strict=True):
         if spot.kind in ("above", "below"):
-            kind = "stability_lost" if (change.at_low < 0) == (spot.kind == "above") else "stability_gained"
+            kind = (
+                "stability_lost"
+                if (change.at_low < 0) == (spot.kind == "above")
+                else "stability_gained"
+            )
             anchors = [*(folds if spot.kind == "above" else ()), *crossings]
             bounds.append(_anchored(spot, anchors, problem.symmetry)._replace(kind=kind))
-        elif spot.kind.startswith("fold") or (_is_known(spot, problem.symmetry) and not overlaps(spot, crossings)):
+        elif spot.kind.startswith("fold") or (
+            _is_known(spot, problem.symmetry) and not overlaps(spot, crossings)
+        ):
             told.append(spot)
-    return told + _known_windows(sorted(bounds, key=lambda spot: spot.where), where, problem.symmetry)
+    return told + _known_windows(
+        sorted(bounds, key=lambda spot: spot.where), where, problem.symmetry
+    )
 
 
 def _is_known(spot: Spot, symmetry: str) -> bool:
@@ -268,25 +317,37 @@ def _is_known(spot: Spot, symmetry: str) -> bool:
 
 
 def _anchored(spot: Spot, anchors: Sequence[Spot], symmetry: str) -> Spot:
-    """A change of stability, at the first place within its error that is known better and where c is as it says.
+    """A change of stability, at the first place within its error that is known better and where c
+    is as it says.
 
-    Where the energy turns back along a family, c - 1 vanishes, too; at a crossing often with several derivatives, so
-    that c alone would not tell where.
+    Where the energy turns back along a family, c - 1 vanishes, too; at a crossing often with
+    several derivatives, so that c alone would not tell where.
     """
     target = 1.0 if spot.kind == "above" else -1.0
     for other in anchors:
-        off, error = measure_of(other.row, symmetry)[0] - target, measure_error(other.row, symmetry)[0]
-        if other.error <= spot.error and abs(other.where - spot.where) <= spot.error and abs(off) <= error:
+        off, error = (
+            measure_of(other.row, symmetry)[0] - target,
+            measure_error(other.row, symmetry)[0],
+        )
+        if (
+            other.error <= spot.error
+            and abs(other.where - spot.where) <= spot.error
+            and abs(off) <= error
+        ):
             return other._replace(kind=spot.kind, branch=spot.branch)
     return spot
 
 
 def _known_windows(bounds: list[Spot], where: np.ndarray, symmetry: str) -> list[Spot]:
-    """Changes of stability, without those that take each other back between two points if c is not known there."""
+    """Changes of stability, without those that take each other back between two points if c is not
+    known there.
+    """
     kept: list[Spot] = []
     for spot in bounds:
         before = kept[-1] if kept and not _is_known(spot, symmetry) else None
-        if before is not None and np.searchsorted(where, before.where) == np.searchsorted(where, spot.where):
+        if before is not None and np.searchsorted(where, before.where) == np.searchsorted(
+            where, spot.where
+        ):
             kept.pop()
         else:
             kept.append(spot)
@@ -297,4 +358,6 @@ def _special(problem: Problem, spot: Spot) -> SpecialPoint:
     both = orbits_of(problem, spot.row), slopes_of(problem, spot.row)
     orbit, slopes = jax.tree.map(lambda leaf: leaf[0], both)
     errors = spot.error, kappa_error(spot, problem.symmetry)
-    return SpecialPoint(spot.where, orbit, slopes, errors, spot.kind, Place(problem, spot.row), spot.branch)
+    return SpecialPoint(
+        spot.where, orbit, slopes, errors, spot.kind, Place(problem, spot.row), spot.branch
+    )

@@ -1,16 +1,18 @@
 """Floquet stability of a symmetric periodic orbit from a half or a quarter of its period.
 
-A state is (theta, p); Phi(t) = [[A, B], [C, D]] is the derivative of the flow over t. The four multipliers are 1, 1 and
-a pair whose half sum is kappa: elliptic for |kappa| < 1, hyperbolic above 1, inverse hyperbolic below -1. Stability is
-read from kappa alone: the trivial pair is a Jordan block, which splits like the square root of the error.
+A state is (theta, p); Phi(t) = [[A, B], [C, D]] is the derivative of the flow over t. The four
+multipliers are 1, 1 and a pair whose half sum is kappa: elliptic for |kappa| < 1, hyperbolic above
+1, inverse hyperbolic below -1. Stability is read from kappa alone: the trivial pair is a Jordan
+block, which splits like the square root of the error.
 
 Time reversal R (theta, p) -> (theta, -p) and reflection (theta, p) -> (-theta, -p) do the rest:
 
-- brake orbit, at rest at 0 and T/2: monodromy R Phi^-1 R Phi with Phi = Phi(T/2), hence kappa = 1 + 2 tr(B^T C);
-- x(T/2) = -x(0): monodromy Phi(T/2)^2; with c = (tr(-Phi(T/2)) - 2)/2, kappa = 2 c^2 - 1 >= -1, so that such orbits
-  never double their period (Frauenfelder and Moreno, arXiv:2301.01803);
-- centred (also theta(T/4) in {0, pi}^2): Phi(T/2) = N Q^-1 N Q with Q = Phi(T/4) = [[a, b], [c', d]], N = -R, and
-  c = 1 - 2 tr(a^T d).
+- brake orbit, at rest at 0 and T/2: monodromy R Phi^-1 R Phi with Phi = Phi(T/2), hence
+  kappa = 1 + 2 tr(B^T C);
+- x(T/2) = -x(0): monodromy Phi(T/2)^2; with c = (tr(-Phi(T/2)) - 2)/2, kappa = 2 c^2 - 1 >= -1, so
+  that such orbits never double their period (Frauenfelder and Moreno, arXiv:2301.01803);
+- centred (also theta(T/4) in {0, pi}^2): Phi(T/2) = N Q^-1 N Q with Q = Phi(T/4) = [[a, b], [c',
+  d]], N = -R, and c = 1 - 2 tr(a^T d).
 """
 
 import math
@@ -32,10 +34,11 @@ from dpend.motion.integrate import march, step_size
 def transition(
     pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar, scheme: Scheme
 ) -> tuple[State, Float[Array, "4 4 ..."]]:
-    """The state after `steps` steps of `dt` [s] and the derivative of that map, Phi[i, j] = d x_i / d x_j(0).
+    """The state after `steps` steps of `dt` [s] and the derivative of that map,
+    Phi[i, j] = d x_i / d x_j(0).
 
-    Rows and columns are in the order theta1, theta2, p1, p2 and in SI units; of a state with leaves of some shape that
-    shape follows them.
+    Rows and columns are in the order theta1, theta2, p1, p2 and in SI units; of a state with leaves
+    of some shape that shape follows them.
     """
     constants = scheme.constants(pendulum, dt)
     shape = jnp.shape(state.theta1)
@@ -51,12 +54,14 @@ def transition(
 def monodromy(
     pendulum: Pendulum | Any, state: State | Any, period: float | Any, scheme: Scheme | Any
 ) -> Float[Array, "4 4"]:
-    """The derivative of the flow over a whole period: needs no symmetry, and is noise once kappa exceeds 1e12.
+    """The derivative of the flow over a whole period: needs no symmetry, and is noise once kappa
+    exceeds 1e12.
 
     Arguments:
         period: the time [s], known before tracing.
     Raises:
-        ValueError: the step is longer than the period; arguments of other classes, arrays, a traced period.
+        ValueError: the step is longer than the period; arguments of other classes, arrays, a traced
+            period.
     """
     check_motion(pendulum, state)
     check_scheme(scheme)
@@ -66,14 +71,18 @@ def monodromy(
 
 
 def half_from_quarter(quarter: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """Phi(T/2) of a centred orbit from Q = Phi(T/4): N Q^-1 N Q, the inverse being the symplectic one."""
+    """Phi(T/2) of a centred orbit from Q = Phi(T/4): N Q^-1 N Q, the inverse being the symplectic
+    one.
+    """
     a, b, c, d = _blocks(quarter)
     back = jnp.block([[d.T, b.T], [c.T, a.T]])  # N Q^-1 N
     return back @ quarter
 
 
 def half_trace(quarter: Float[Array, "4 4"]) -> Scalar:
-    """c = (tr(-Phi(T/2)) - 2)/2 of a centred orbit from Q = Phi(T/4); kappa = 2 c^2 - 1, stability ends at c = 1."""
+    """c = (tr(-Phi(T/2)) - 2)/2 of a centred orbit from Q = Phi(T/4); kappa = 2 c^2 - 1, stability
+    ends at c = 1.
+    """
     a, _, _, d = _blocks(quarter)
     return 1 - 2 * jnp.sum(a * d)
 
@@ -100,14 +109,15 @@ def kappa_of_monodromy(matrix: Float[Array, "4 4"]) -> Scalar:
 
 
 def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, Any]:
-    """c (NaN for brake orbits), kappa and log |kappa| from Phi over the shooting time, given as a product.
+    """c (NaN for brake orbits), kappa and log |kappa| from Phi over the shooting time, given as a
+    product.
 
-    The same as `kappa_of_centred`, `kappa_of_brake` and `kappa_of_odd`, but that the product is scaled as it grows: no
-    kappa is too large for its logarithm.
+    The same as `kappa_of_centred`, `kappa_of_brake` and `kappa_of_odd`, but that the product is
+    scaled as it grows: no kappa is too large for its logarithm.
 
     Arguments:
-        matrices: of the consecutive segments of a quarter (centred) or half (brake, odd) of the period, shape
-            (..., S, 4, 4).
+        matrices: of the consecutive segments of a quarter (centred) or half (brake, odd) of the
+            period, shape (..., S, 4, 4).
         symmetry: `centred`, `brake` or `odd`.
         xp: numpy, or jax.numpy under differentiation.
     """
@@ -115,9 +125,17 @@ def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, 
     if symmetry == "odd":
         offset, trace = -1.0, -0.5 * product.trace(axis1=-2, axis2=-1)
     elif symmetry == "centred":
-        offset, trace, scale = 1.0, -2 * (product[..., :2, :2] * product[..., 2:, 2:]).sum(axis=(-2, -1)), 2 * scale
+        offset, trace, scale = (
+            1.0,
+            -2 * (product[..., :2, :2] * product[..., 2:, 2:]).sum(axis=(-2, -1)),
+            2 * scale,
+        )
     else:
-        offset, trace, scale = 1.0, 2 * (product[..., :2, 2:] * product[..., 2:, :2]).sum(axis=(-2, -1)), 2 * scale
+        offset, trace, scale = (
+            1.0,
+            2 * (product[..., :2, 2:] * product[..., 2:, :2]).sum(axis=(-2, -1)),
+            2 * scale,
+        )
     value = offset + trace * xp.exp(xp.minimum(scale, _LARGEST_EXPONENT))
     beyond = scale > _MANY_DIGITS
     logarithm = xp.where(beyond, scale, 0.0) + _log_abs(xp.where(beyond, trace, value), xp)
@@ -130,26 +148,35 @@ def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, 
 
 
 def _product(matrices: Any, xp: Any) -> tuple[Any, Any]:
-    """The product of consecutive matrices, its largest entry made 1, and the logarithm of what it was divided by."""
+    """The product of consecutive matrices, its largest entry made 1, and the logarithm of what it
+    was divided by.
+    """
     product, scale = xp.eye(4), xp.zeros(matrices.shape[:-3])
     for i in range(matrices.shape[-3]):
         product = matrices[..., i, :, :] @ product
-        size = lax.stop_gradient(abs(product).max(axis=(-2, -1))) if xp is jnp else abs(product).max(axis=(-2, -1))
+        size = (
+            lax.stop_gradient(abs(product).max(axis=(-2, -1)))
+            if xp is jnp
+            else abs(product).max(axis=(-2, -1))
+        )
         product, scale = product / size[..., None, None], scale + xp.log(size)
     return product, scale
 
 
 def growth_of(matrices: np.ndarray, symmetry: str) -> np.ndarray:
-    """What rounding is multiplied by in the c, or kappa of brake orbits, that `stability_of` makes of Phi.
+    """What rounding is multiplied by in the c, or kappa of brake orbits, that `stability_of` makes
+    of Phi.
 
-    Both are sums of products of entries of Phi, of `odd` orbits of entries, that may cancel. The blocks are measured so
-    that the unit of momentum does not count.
+    Both are sums of products of entries of Phi, of `odd` orbits of entries, that may cancel. The
+    blocks are measured so that the unit of momentum does not count.
     """
     product, scale = _product(matrices, np)
     blocks = product[..., :2, :2], product[..., 2:, 2:], product[..., :2, 2:], product[..., 2:, :2]
     a, d, b, c = (abs(block).max(axis=(-2, -1)) for block in blocks)
     logarithm = scale + np.log(np.maximum(np.maximum(a, d), np.sqrt(b * c)))
-    return np.asarray(np.exp(np.minimum((1 if symmetry == "odd" else 2) * logarithm, _LARGEST_EXPONENT)))
+    return np.asarray(
+        np.exp(np.minimum((1 if symmetry == "odd" else 2) * logarithm, _LARGEST_EXPONENT))
+    )
 
 
 def _log_abs(value: Any, xp: Any) -> Any:
@@ -168,13 +195,16 @@ def multipliers(kappa: Scalar) -> Complex[Array, "4 ..."]:
         ValueError: kappa is neither a real number nor an array of them.
     """
     kappa = jnp.asarray(real("kappa", kappa), jnp.complex128)
-    large = kappa + jnp.sqrt(kappa - 1) * jnp.sqrt(kappa + 1)  # the two principal roots never cancel against kappa
+    large = kappa + jnp.sqrt(kappa - 1) * jnp.sqrt(
+        kappa + 1
+    )  # the two principal roots never cancel against kappa
     one = jnp.ones_like(large)
     return jnp.stack([one, one, large, 1 / large])
 
 
 def stability_class(kappa: float | Any) -> str:
-    """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where kappa is NaN.
+    """`elliptic`, `hyperbolic`, `inverse hyperbolic`; `parabolic` at exactly +-1; `unknown` where
+    kappa is NaN.
 
     Raises:
         ValueError: kappa is no single real number, or traced by `jit`.

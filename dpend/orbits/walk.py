@@ -15,7 +15,9 @@ from dpend.orbits.newton import METRIC, ROW, Corrected, corrected
 
 
 def hermite(start: Any, slope: Any, end: Any, end_slope: Any, length: Any, s: Any) -> Any:
-    """The cubic through two points with unit tangents, `length` apart, at s in [0, 1]; beyond 1 it predicts."""
+    """The cubic through two points with unit tangents, `length` apart, at s in [0, 1]; beyond 1 it
+    predicts.
+    """
     s2, s3 = s * s, s * s * s
     return (
         (2 * s3 - 3 * s2 + 1) * start
@@ -27,13 +29,16 @@ def hermite(start: Any, slope: Any, end: Any, end_slope: Any, length: Any, s: An
 
 # The first step from a normal mode, where the linear motion is true to 1e-4.
 FIRST_STEP = 0.02
-# A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of the step's length).
+# A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of
+# the step's length).
 _LEAST_COSINE, _LARGEST_MISS, _WANTED_MISS = 0.95, 0.2, 0.02
-# Newton's second update over its first (Deuflhard's contraction test), where they are not both small.
+# Newton's second update over its first (Deuflhard's contraction test), where they are not both
+# small.
 _LARGEST_CONTRACTION, _SMALL = 0.05, 1e-5
-# Two curves that pass each other closer than this [arclength] count as crossing: the walk goes straight on, and tells.
-# Where no step as short is taken, it leaps along the tangent from before the curve began to turn into the other; where
-# that does not land either, it is a turn, however sharp, and is followed.
+# Two curves that pass each other closer than this [arclength] count as crossing: the walk goes
+# straight on, and tells. Where no step as short is taken, it leaps along the tangent from before
+# the curve began to turn into the other; where that does not land either, it is a turn, however
+# sharp, and is followed.
 CROSSING, _LEAP = 2e-4, 0.01
 _LARGEST_LEAP_MISS = 0.3
 _SHORTEST_STEP = 1e-8
@@ -42,7 +47,9 @@ CHUNK = 32
 
 
 class Walk(NamedTuple):
-    """Where a walk stands: its last point, the one before, and what it knows about the next step."""
+    """Where a walk stands: its last point, the one before, and what it knows about the next
+    step.
+    """
 
     point: Any
     tangent: Any
@@ -57,12 +64,21 @@ class Walk(NamedTuple):
 
 
 def beginning(pendulum: Pendulum, slow: Scalar) -> Walk:
-    """A walk at zero amplitude, about to follow the slow or the fast normal mode (natural units)."""
+    """A walk at zero amplitude, about to follow the slow or the fast normal mode (natural
+    units).
+    """
     modes = normal_modes(pendulum)
     mode = jax.tree.map(lambda a, b: jnp.where(slow, a, b), *modes)
     phase = 0.5 * jnp.pi / SEGMENTS * jnp.arange(SEGMENTS, dtype=jnp.float64)
-    moving = momenta(pendulum, 0.0, 0.0, mode.frequency, mode.frequency * mode.ratio)  # at the bottom
-    shape = [jnp.cos(phase), mode.ratio * jnp.cos(phase), -moving.p1 * jnp.sin(phase), -moving.p2 * jnp.sin(phase)]
+    moving = momenta(
+        pendulum, 0.0, 0.0, mode.frequency, mode.frequency * mode.ratio
+    )  # at the bottom
+    shape = [
+        jnp.cos(phase),
+        mode.ratio * jnp.cos(phase),
+        -moving.p1 * jnp.sin(phase),
+        -moving.p2 * jnp.sin(phase),
+    ]
     tangent = jnp.append(jnp.stack(shape, axis=1).ravel(), jnp.zeros(2))
     tangent = tangent / jnp.sqrt(tangent @ (METRIC * tangent))
     # There the fastest rate is that of the fast mode.
@@ -70,11 +86,15 @@ def beginning(pendulum: Pendulum, slow: Scalar) -> Walk:
     point = jnp.append(jnp.zeros(LOG_DELTA), jnp.stack([jnp.log(delta), 0.0]))
     nothing = jnp.zeros(())
     first, steps = jnp.asarray(FIRST_STEP), jnp.asarray(4)
-    return Walk(point, tangent, point, tangent, nothing, first, nothing, steps, tangent, jnp.asarray(0))
+    return Walk(
+        point, tangent, point, tangent, nothing, first, nothing, steps, tangent, jnp.asarray(0)
+    )
 
 
 class Tasks(NamedTuple):
-    """Points to be corrected one by one, each in the plane that its row is normal to; `CHUNK` of them at most."""
+    """Points to be corrected one by one, each in the plane that its row is normal to; `CHUNK` of
+    them at most.
+    """
 
     points: Any
     rows: Any
@@ -82,11 +102,13 @@ class Tasks(NamedTuple):
     number: Any
 
 
-# Where a family ends: this close to the energy of an equilibrium with a rod upright (in units of the weights' torques,
-# the energy's slope in arclength as small), or where it has shrunk to this amplitude [rad] about an equilibrium.
+# Where a family ends: this close to the energy of an equilibrium with a rod upright (in units of
+# the weights' torques, the energy's slope in arclength as small), or where it has shrunk to this
+# amplitude [rad] about an equilibrium.
 HOMOCLINIC, _SMALLEST = 1e-8, 0.01
-# Orbits that pass an equilibrium on their way are known no better than rounding over the distance from its energy:
-# where that has come to the second number [rad], the family has ended at the first.
+# Orbits that pass an equilibrium on their way are known no better than rounding over the distance
+# from its energy: where that has come to the second number [rad], the family has ended at the
+# first.
 NEARLY, _BLURRED = 1e-6, 1e-8
 
 
@@ -99,8 +121,8 @@ def walk(
     One program for both, and for all symmetries: it takes seconds to compile.
 
     Returns:
-        Where the walk stands, a table whose rows are `Corrected`, how many there are, and whether the family has ended
-        (1), or no step is short enough (2).
+        Where the walk stands, a table whose rows are `Corrected`, how many there are, and whether
+        the family has ended (1), or no step is short enough (2).
     """
     given = tasks.number > 0
     most = jnp.where(given, tasks.number, CHUNK)
@@ -128,9 +150,11 @@ def walk(
     return lax.while_loop(going, advance, begin)
 
 
-def stride(pendulum: Pendulum, w: Walk, longest: Scalar, arc: Arc) -> tuple[Walk, Corrected, Scalar, Scalar]:
-    """One step of a walk, or an attempt: where it stands then, the point, whether it was taken, and the status that
-    `walk` gives.
+def stride(
+    pendulum: Pendulum, w: Walk, longest: Scalar, arc: Arc
+) -> tuple[Walk, Corrected, Scalar, Scalar]:
+    """One step of a walk, or an attempt: where it stands then, the point, whether it was taken, and
+    the status that `walk` gives.
     """
     ahead, along = _ahead(w)
     new = corrected(pendulum, ahead, METRIC * along, w.steps, arc)
@@ -139,7 +163,9 @@ def stride(pendulum: Pendulum, w: Walk, longest: Scalar, arc: Arc) -> tuple[Walk
 
 
 def _ahead(w: Walk) -> tuple[Array, Array]:
-    """The predicted point, by the cubic if it is not much longer than the last step, and the direction it lies in."""
+    """The predicted point, by the cubic if it is not much longer than the last step, and the
+    direction it lies in.
+    """
     near = (w.step <= 2.1 * w.length) & (w.length > 0) & (w.leap != 1)
     share = 1 + w.step / jnp.where(w.length > 0, w.length, 1.0)
     cubic = hermite(w.behind, w.behind_tangent, w.point, w.tangent, w.length, share)
@@ -152,13 +178,17 @@ def _amplitude(point: Array) -> Scalar:
     return jnp.max(jnp.abs(jnp.sin(point[:LOG_DELTA].reshape(SEGMENTS, 4)[:, :2])))
 
 
-def _judged(pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar) -> tuple[Walk, Scalar, Scalar]:
+def _judged(
+    pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar
+) -> tuple[Walk, Scalar, Scalar]:
     """The walk after a step, whether that was taken or taken back, and how the family stands."""
     miss = new.miss / w.step
     leaping = w.leap == 1
     same_side = (new.side == w.side) | (w.side == 0) | (w.step < CROSSING)
     smooth = (new.contraction <= _LARGEST_CONTRACTION) | (new.miss <= _SMALL)
-    smooth = jnp.where(leaping, miss <= _LARGEST_LEAP_MISS, same_side & smooth & (miss <= _LARGEST_MISS))
+    smooth = jnp.where(
+        leaping, miss <= _LARGEST_LEAP_MISS, same_side & smooth & (miss <= _LARGEST_MISS)
+    )
     tangent = jnp.where(leaping, w.straight, w.tangent)
     good = new.converged & smooth & ((METRIC * new.tangent) @ tangent >= _LEAST_COSINE)
     taken = good & (2 * new.steps <= 3 * w.steps)
@@ -193,7 +223,9 @@ def _judged(pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar) -> tup
         leap=jnp.where(w.step < 2 * CROSSING, w.leap, 0),
     )
     close = jnp.where(new.angle_error > _BLURRED, NEARLY, HOMOCLINIC)
-    homoclinic = jnp.any(jnp.abs(gaps[1:]) < close) & (jnp.abs(new.energy_slope) < 1e3 * close * unit)
+    homoclinic = jnp.any(jnp.abs(gaps[1:]) < close) & (
+        jnp.abs(new.energy_slope) < 1e3 * close * unit
+    )
     ended = homoclinic | (shrinking & (size < _SMALLEST))
     status = jnp.where(taken & ended, 1, jnp.where(w.step < _SHORTEST_STEP, 2, 0))
     return jax.tree.map(partial(jnp.where, taken), after, before), taken, status

@@ -1,8 +1,9 @@
-"""What people would integrate many or single double pendulums with instead, as jobs to be timed and held to the truth.
+"""What people would integrate many or single double pendulums with instead, as jobs to be timed and
+held to the truth.
 
-Each function takes releases theta1 and theta2 [rad] of the paper's pendulum and a duration [s], and gives jobs by name:
-functions of nothing that return the angles at the end, shape (2, n). A peer that is not installed, or not for this
-machine, is left out and named.
+Each function takes releases theta1 and theta2 [rad] of the paper's pendulum and a duration [s], and
+gives jobs by name: functions of nothing that return the angles at the end, shape (2, n). A peer
+that is not installed, or not for this machine, is left out and named.
 """
 
 import ctypes
@@ -27,35 +28,60 @@ def missing(name: str, why: str = "not installed") -> dict:
     return {}
 
 
-# --- C ----------------------------------------------------------------------------------------------------------------
+# --- C --------------------------------------------------------------------------------------------
 
 
 def c_kernels(theta1, theta2, duration: float, steps: tuple) -> dict:
-    """RK4 in C with AVX-512 and OpenMP, with sines and without; lanes filled up to a multiple of 32."""
+    """RK4 in C with AVX-512 and OpenMP, with sines and without; lanes filled up to a multiple of
+    32.
+    """
     compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None or not Path("/proc/cpuinfo").exists() or "avx512f" not in Path("/proc/cpuinfo").read_text():
+    if (
+        compiler is None
+        or not Path("/proc/cpuinfo").exists()
+        or "avx512f" not in Path("/proc/cpuinfo").read_text()
+    ):
         return missing("C kernels", "no compiler, or no AVX-512")
     folder, jobs = Path(tempfile.mkdtemp()), {}
     for name, what in (("plain", "C, RK4"), ("circle", "C, RK4 without sines")):
         library = folder / f"{name}.so"
-        flags = "-O3 -march=native -ffp-contract=fast -fno-math-errno -mprefer-vector-width=512 -fopenmp".split()
-        subprocess.run([compiler, *flags, "-shared", "-fPIC", HERE / f"{name}.c", "-o", library], check=True)
+        flags = (
+            "-O3 -march=native -ffp-contract=fast -fno-math-errno -mprefer-vector-width=512 "
+            "-fopenmp".split()
+        )
+        subprocess.run(
+            [compiler, *flags, "-shared", "-fPIC", HERE / f"{name}.c", "-o", library], check=True
+        )
         run = ctypes.CDLL(str(library)).run
         for step in steps:
-            jobs[what, step] = c_job(run, name == "circle", theta1, theta2, round(duration / step), step)
+            jobs[what, step] = c_job(
+                run, name == "circle", theta1, theta2, round(duration / step), step
+            )
     return jobs
 
 
 def c_job(run, circle: bool, theta1, theta2, count: int, step: float):
     inertia = M2 * L2 * L2 * L1 * L1
     constants = np.array(
-        [(M1 + M2) * L1 * L1, M2 * L2 * L2, M2 * L1 * L2, (M1 + M2) * G * L1, M2 * G * L2, inertia * M1, inertia * M2]
+        [
+            (M1 + M2) * L1 * L1,
+            M2 * L2 * L2,
+            M2 * L1 * L2,
+            (M1 + M2) * G * L1,
+            M2 * G * L2,
+            inertia * M1,
+            inertia * M2,
+        ]
     )
     kept = theta1.size
     lanes = -(-kept // 32) * 32
-    theta1, theta2 = (np.concatenate([x, np.repeat(x[-1:], lanes - kept)]) for x in (theta1, theta2))
+    theta1, theta2 = (
+        np.concatenate([x, np.repeat(x[-1:], lanes - kept)]) for x in (theta1, theta2)
+    )
     zero = np.zeros(lanes)
-    trigonometry = [np.sin(theta1), np.cos(theta1), np.sin(theta2), np.cos(theta2)] if circle else []
+    trigonometry = (
+        [np.sin(theta1), np.cos(theta1), np.sin(theta2), np.cos(theta2)] if circle else []
+    )
     start = np.stack([theta1, theta2, *trigonometry, zero, zero])
     raw = np.empty(start.size + 8)
     data = raw[(-raw.ctypes.data // 8) % 8 :][: start.size].reshape(start.shape)
@@ -69,7 +95,7 @@ def c_job(run, circle: bool, theta1, theta2, count: int, step: float):
     return job
 
 
-# --- numba ------------------------------------------------------------------------------------------------------------
+# --- numba ----------------------------------------------------------------------------------------
 
 
 def numba_kernels(theta1, theta2, duration: float, steps: tuple) -> dict:
@@ -94,8 +120,12 @@ def numba_kernels(theta1, theta2, duration: float, steps: tuple) -> dict:
             a, b, p, q = theta1[i], theta2[i], 0.0, 0.0
             for _ in range(steps):
                 a1, b1, p1, q1 = slope(a, b, p, q)
-                a2, b2, p2, q2 = slope(a + h / 2 * a1, b + h / 2 * b1, p + h / 2 * p1, q + h / 2 * q1)
-                a3, b3, p3, q3 = slope(a + h / 2 * a2, b + h / 2 * b2, p + h / 2 * p2, q + h / 2 * q2)
+                a2, b2, p2, q2 = slope(
+                    a + h / 2 * a1, b + h / 2 * b1, p + h / 2 * p1, q + h / 2 * q1
+                )
+                a3, b3, p3, q3 = slope(
+                    a + h / 2 * a2, b + h / 2 * b2, p + h / 2 * p2, q + h / 2 * q2
+                )
                 a4, b4, p4, q4 = slope(a + h * a3, b + h * b3, p + h * p3, q + h * q3)
                 a += h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
                 b += h / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
@@ -115,7 +145,7 @@ def numba_kernels(theta1, theta2, duration: float, steps: tuple) -> dict:
     return {("numba, RK4", step): job(step) for step in steps}
 
 
-# --- heyoka -----------------------------------------------------------------------------------------------------------
+# --- heyoka ---------------------------------------------------------------------------------------
 
 
 def heyoka_system(kind=float):
@@ -149,7 +179,9 @@ def heyoka_batches(theta1, theta2, duration: float, tolerances: tuple) -> dict:
     width, threads = heyoka.recommended_simd_size(), len(os.sched_getaffinity(0))
     kept = theta1.size
     lanes = -(-kept // width) * width
-    theta1, theta2 = (np.concatenate([x, np.repeat(x[-1:], lanes - kept)]) for x in (theta1, theta2))
+    theta1, theta2 = (
+        np.concatenate([x, np.repeat(x[-1:], lanes - kept)]) for x in (theta1, theta2)
+    )
 
     def job(tolerance):
         workers = []  # made by the first call, as that compiles
@@ -160,13 +192,20 @@ def heyoka_batches(theta1, theta2, duration: float, tolerances: tuple) -> dict:
             for i in range(index * width, lanes, width * threads):
                 integrator.set_time(0.0)
                 integrator.state[:] = 0.0
-                integrator.state[0], integrator.state[1] = theta1[i : i + width], theta2[i : i + width]
+                integrator.state[0], integrator.state[1] = (
+                    theta1[i : i + width],
+                    theta2[i : i + width],
+                )
                 integrator.propagate_until(duration)
                 out[:, i : i + width] = integrator.state[:2]
 
         def once():
             while len(workers) < threads:
-                workers.append(heyoka.taylor_adaptive_batch(heyoka_system(), np.zeros((4, width)), tol=tolerance))
+                workers.append(
+                    heyoka.taylor_adaptive_batch(
+                        heyoka_system(), np.zeros((4, width)), tol=tolerance
+                    )
+                )
             with ThreadPoolExecutor(threads) as pool:
                 list(pool.map(share, range(threads)))
             return out[:, :kept]
@@ -177,7 +216,9 @@ def heyoka_batches(theta1, theta2, duration: float, tolerances: tuple) -> dict:
 
 
 def heyoka_singles(theta1, theta2, duration: float, tolerances: tuple, kind=float) -> dict:
-    """One adaptive Taylor integration after the other; with `kind` np.longdouble in extended precision."""
+    """One adaptive Taylor integration after the other; with `kind` np.longdouble in extended
+    precision.
+    """
     try:
         import heyoka
     except ImportError:
@@ -190,7 +231,9 @@ def heyoka_singles(theta1, theta2, duration: float, tolerances: tuple, kind=floa
         def once():
             if not made:
                 made.append(
-                    heyoka.taylor_adaptive(heyoka_system(kind), [kind(0)] * 4, fp_type=kind, tol=kind(tolerance))
+                    heyoka.taylor_adaptive(
+                        heyoka_system(kind), [kind(0)] * 4, fp_type=kind, tol=kind(tolerance)
+                    )
                 )
             integrator = made[0]
             for i in range(theta1.size):
@@ -205,7 +248,7 @@ def heyoka_singles(theta1, theta2, duration: float, tolerances: tuple, kind=floa
     return {("heyoka, adaptive", tolerance): job(tolerance) for tolerance in tolerances}
 
 
-# --- diffrax and SciPy ------------------------------------------------------------------------------------------------
+# --- diffrax and SciPy ----------------------------------------------------------------------------
 
 
 def diffrax_vmapped(theta1, theta2, duration: float, tolerances: tuple) -> dict:
@@ -223,9 +266,14 @@ def diffrax_vmapped(theta1, theta2, duration: float, tolerances: tuple) -> dict:
         def one(theta1, theta2):
             solution = diffrax.diffeqsolve(
                 diffrax.ODETerm(lambda t, x, args: dpend.vector_field(pendulum, x)),
-                diffrax.Dopri8(), 0.0, duration, None, dpend.released(theta1, theta2),
-                stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance * 1e-2), max_steps=100_000,
-            )  # fmt: skip
+                diffrax.Dopri8(),
+                0.0,
+                duration,
+                None,
+                dpend.released(theta1, theta2),
+                stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance * 1e-2),
+                max_steps=100_000,
+            )
             return solution.ys.theta1[0], solution.ys.theta2[0]
 
         if theta1.size > 16:
@@ -256,7 +304,14 @@ def scipy_one_by_one(theta1, theta2, duration: float, tolerances: tuple) -> dict
     def job(tolerance):
         def once():
             ends = [
-                solve_ivp(slope, (0, duration), (a, b, 0.0, 0.0), "DOP853", rtol=tolerance, atol=tolerance * 1e-2).y
+                solve_ivp(
+                    slope,
+                    (0, duration),
+                    (a, b, 0.0, 0.0),
+                    "DOP853",
+                    rtol=tolerance,
+                    atol=tolerance * 1e-2,
+                ).y
                 for a, b in zip(theta1, theta2, strict=True)
             ]
             return np.array([end[:2, -1] for end in ends]).T

@@ -32,32 +32,47 @@ def forty(forty_and_steps):
 
 def test_the_eight_orbits_of_forty_degrees(forty):
     """All of them, no others, none of the two second returns, and nothing in doubt."""
-    known = sorted((period, theta2) for theta2, period in FORTY if period not in (1.579211862, 1.508837732))
+    known = sorted(
+        (period, theta2) for theta2, period in FORTY if period not in (1.579211862, 1.508837732)
+    )
     np.testing.assert_allclose(forty.table["period"], [period for period, _ in known], atol=1e-9)
-    np.testing.assert_allclose(np.degrees(forty.table["theta2"]), [theta2 for _, theta2 in known], atol=2e-9)
+    np.testing.assert_allclose(
+        np.degrees(forty.table["theta2"]), [theta2 for _, theta2 in known], atol=2e-9
+    )
     assert (
-        forty.table["symmetry"].tolist() == ["centred"] * 2 + ["brake", "centred", "brake", "centred"] + ["brake"] * 2
+        forty.table["symmetry"].tolist()
+        == ["centred"] * 2 + ["brake", "centred", "brake", "centred"] + ["brake"] * 2
     )
     assert np.all(forty.table["status"] == Status.CONVERGED)
     seen = forty.coverage
-    assert (seen.suspicious_cells, seen.slices, seen.refinements, seen.degree) == (0, 1, 2, seen.winding)
+    assert (seen.suspicious_cells, seen.slices, seen.refinements, seen.degree) == (
+        0,
+        1,
+        2,
+        seen.winding,
+    )
 
 
 @pytest.mark.slow
 def test_every_row_is_an_orbit(forty, paper):
-    """At rest at its dual after half the period and back after the whole, by diffrax; kappa by the whole monodromy; all
-    as well as kappa allows."""
+    """At rest at its dual after half the period and back after the whole, by diffrax; kappa by the
+    whole monodromy; all as well as kappa allows.
+    """
     for orbit in forty.orbits:
         growth = max(1.0, abs(2 * orbit.kappa))
         half, whole = (orbit.period / 2, orbit.period)
         end = dpend.reference(paper, orbit.state, [half, whole], error=False).state
         states = np.stack(jax.tree.leaves(end))
-        np.testing.assert_allclose(states[:2, 0], [orbit.dual.theta1, orbit.dual.theta2], atol=1e-11 * growth)
+        np.testing.assert_allclose(
+            states[:2, 0], [orbit.dual.theta1, orbit.dual.theta2], atol=1e-11 * growth
+        )
         np.testing.assert_allclose(states[:2, 1], [orbit.theta1, orbit.theta2], atol=1e-11 * growth)
         np.testing.assert_allclose(states[2:], 0, atol=1e-12 * growth)
         assert orbit.residual < 1e-12 * growth
         assert max(orbit.error_estimate) < 1e-9
-        np.testing.assert_allclose((np.trace(monodromy(orbit, 1.0)) - 2) / 2, orbit.kappa, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(
+            (np.trace(monodromy(orbit, 1.0)) - 2) / 2, orbit.kappa, rtol=1e-7, atol=1e-7
+        )
         np.testing.assert_allclose(dpend.hamiltonian(paper, orbit.state), orbit.energy, rtol=1e-14)
 
 
@@ -65,7 +80,9 @@ def test_a_longer_list_holds_the_shorter(forty, paper):
     shorter = dpend.find_brake_orbits(paper, theta1=np.radians(40.0), max_period=1.3)
     assert len(shorter) == 5
     np.testing.assert_allclose(shorter.table["theta2"], forty.table["theta2"][:5], atol=1e-13)
-    last = dpend.find_brake_orbits(paper, theta1=np.radians(40.0), max_period=float(forty.table["period"][4]))
+    last = dpend.find_brake_orbits(
+        paper, theta1=np.radians(40.0), max_period=float(forty.table["period"][4])
+    )
     assert len(last) == 5  # the longest period itself is in
 
 
@@ -73,14 +90,18 @@ def test_mirror_turns_and_units(forty):
     """theta -> -theta; full turns; lengths and gravity scale the period alone."""
     other = Pendulum(0.05, 0.05, 3.0, 3.0, 1.6)
     scale = np.sqrt(0.05 / 1.6 / (0.2 / 9.8))
-    mirrored = dpend.find_brake_orbits(other, theta1=np.radians(-40.0 - 360.0), max_period=2.0 * scale)
+    mirrored = dpend.find_brake_orbits(
+        other, theta1=np.radians(-40.0 - 360.0), max_period=2.0 * scale
+    )
     np.testing.assert_allclose(mirrored.table["theta2"], -forty.table["theta2"], atol=1e-12)
     np.testing.assert_allclose(mirrored.table["period"], scale * forty.table["period"], rtol=1e-13)
 
 
 @pytest.mark.slow
 def test_mirror_images_are_listed_once_where_the_upper_rod_hangs(paper):
-    """Released with the upper rod straight down or up, theta2 and -theta2 are one orbit; and the equilibria none."""
+    """Released with the upper rod straight down or up, theta2 and -theta2 are one orbit; and the
+    equilibria none.
+    """
     down = dpend.find_brake_orbits(paper, theta1=0.0, max_period=2.0)
     up = dpend.find_brake_orbits(paper, theta1=np.pi, max_period=2.0)
     assert (len(down), len(up)) == (1, 6)
@@ -94,8 +115,12 @@ def test_near_the_bottom_there_are_the_normal_modes(paper):
     found = dpend.find_brake_orbits(paper, theta1=1e-3, max_period=1.2).where(symmetry="centred")
     small = np.abs(found.table["theta2"]) < 0.1
     modes = dpend.normal_modes(paper)[::-1]
-    np.testing.assert_allclose(found.table["theta2"][small] / 1e-3, [mode.ratio for mode in modes], rtol=1e-5)
-    np.testing.assert_allclose(found.table["period"][small], [mode.period for mode in modes], rtol=1e-5)
+    np.testing.assert_allclose(
+        found.table["theta2"][small] / 1e-3, [mode.ratio for mode in modes], rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        found.table["period"][small], [mode.period for mode in modes], rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("ending", ["json", "csv"])
@@ -116,7 +141,9 @@ def test_files_hold_every_bit(forty, tmp_path, ending):
 def test_the_record_names_its_units(forty):
     record = json.loads(json.dumps(forty.record()["orbits"][0]))
     np.testing.assert_allclose(record["theta1_deg"], 40.0, rtol=1e-15)
-    assert {"theta2_deg", "period_s", "energy_J", "kappa", "symmetry", "dual", "residual"} <= set(record)
+    assert {"theta2_deg", "period_s", "energy_J", "kappa", "symmetry", "dual", "residual"} <= set(
+        record
+    )
     np.testing.assert_allclose(record["dual"]["theta1_deg"], -40.0, rtol=1e-14)
 
 
@@ -178,15 +205,25 @@ def test_what_is_no_number_is_refused(paper, wrong):
 
 def test_traced_requests_are_refused(paper):
     with pytest.raises(ValueError, match="theta1 must be a number here, not traced"):
-        jax.jit(lambda x: dpend.find_brake_orbits(paper, theta1=x, max_period=1.0).table["period"][0])(1.0)
+        jax.jit(
+            lambda x: dpend.find_brake_orbits(paper, theta1=x, max_period=1.0).table["period"][0]
+        )(1.0)
 
 
 @pytest.mark.parametrize(
     ("pendulum", "request_", "said"),
     [
         (Pendulum(), {"theta1": 1e300}, r"theta1 must be at most 1.3e\+07 rad"),
-        (Pendulum(), {"max_period": 15.8}, "max_period must be so short that most_steps, 3e.08, are enough"),
-        (Pendulum(), {"most_steps": 1000}, "max_period must be so short that most_steps, 1000, are enough"),
+        (
+            Pendulum(),
+            {"max_period": 15.8},
+            "max_period must be so short that most_steps, 3e.08, are enough",
+        ),
+        (
+            Pendulum(),
+            {"most_steps": 1000},
+            "max_period must be so short that most_steps, 1000, are enough",
+        ),
         (Pendulum(), {"most_steps": np.nan}, "most_steps must be a finite positive number"),
         (Pendulum(), {"most_steps": True}, "most_steps must be a finite positive number, got True"),
         (Pendulum(m1=1e300), {}, "m1 and m2 must be within a factor of 1e30"),
@@ -234,7 +271,10 @@ def test_other_costs_are_told_before_they_are_spent(pendulum, theta1, max_period
     """To a factor of three."""
     told = []
     dpend.find_brake_orbits(
-        Pendulum(*pendulum), theta1=theta1, max_period=max_period, progress=lambda *steps: told.append(steps)
+        Pendulum(*pendulum),
+        theta1=theta1,
+        max_period=max_period,
+        progress=lambda *steps: told.append(steps),
     )
     first, last = told[0], told[-1]
     assert first[0] == 0
@@ -244,7 +284,9 @@ def test_other_costs_are_told_before_they_are_spent(pendulum, theta1, max_period
 @pytest.mark.slow
 @pytest.mark.parametrize("theta1", [1e-9, -1e-6])
 def test_tiny_swings(paper, theta1):
-    """The fast mode, and the oscillation about the state with the lower rod upright, however small."""
+    """The fast mode, and the oscillation about the state with the lower rod upright, however
+    small.
+    """
     found = dpend.find_brake_orbits(paper, theta1=theta1, max_period=0.85)
     _, fast = dpend.normal_modes(paper)
     upright = 2 * np.pi / np.max(np.imag(dpend.equilibria(paper).exponents[1]))
@@ -258,7 +300,12 @@ def test_files_that_are_no_atlas(forty, tmp_path):
         forty.save(tmp_path / "a.txt")
     with pytest.raises(ValueError, match="path must be a file that can be read"):
         dpend.load_atlas(tmp_path / "none.json")
-    for name, text in (("a.json", "{}"), ("b.json", "[1]"), ("c.csv", "theta1,theta2\n1,2\n"), ("d.json", "\x00")):
+    for name, text in (
+        ("a.json", "{}"),
+        ("b.json", "[1]"),
+        ("c.csv", "theta1,theta2\n1,2\n"),
+        ("d.json", "\x00"),
+    ):
         (tmp_path / name).write_text(text)
         with pytest.raises(ValueError, match="path must be a file that Atlas.save wrote"):
             dpend.load_atlas(tmp_path / name)
@@ -266,9 +313,16 @@ def test_files_that_are_no_atlas(forty, tmp_path):
 
 def test_the_published_catalogue(paper):
     """Both files hold the same orbits; a few of each family are solved again from their digits."""
-    published, same = (dpend.load_atlas(CATALOGUE / f"brake_orbits.{ending}") for ending in ("csv", "json"))
-    assert [one["family"] for one in published.families if one["symmetry"] == "brake"] == [f"B{i}" for i in range(1, 7)]
-    assert (published.coverage.suspicious_cells, published.coverage.degree) == (0, published.coverage.winding)
+    published, same = (
+        dpend.load_atlas(CATALOGUE / f"brake_orbits.{ending}") for ending in ("csv", "json")
+    )
+    assert [one["family"] for one in published.families if one["symmetry"] == "brake"] == [
+        f"B{i}" for i in range(1, 7)
+    ]
+    assert (published.coverage.suspicious_cells, published.coverage.degree) == (
+        0,
+        published.coverage.winding,
+    )
     for key, column in published.table.items():
         np.testing.assert_array_equal(column, same.table[key])
     for one in published.families:

@@ -1,4 +1,6 @@
-"""The whole square: linear theory at the families' ends, single angles, an interruption, and the table's rows."""
+"""The whole square: linear theory at the families' ends, single angles, an interruption, and the
+table's rows.
+"""
 
 import json
 
@@ -26,7 +28,9 @@ def square(paper):
 
 
 def test_the_only_family_below_the_period_of_every_other_mode(paper):
-    """Up to 0.6 s there is the fast mode's, every slice has one return, and the periods rise with the energy."""
+    """Up to 0.6 s there is the fast mode's, every slice has one return, and the periods rise with
+    the energy.
+    """
     found = dpend.find_brake_families(paper, max_period=0.6)
     (only,) = found.families
     assert (only["family"], only["ends"]) == ("C1", ["normal mode", "longest period"])
@@ -91,14 +95,26 @@ SETTINGS = "store must have been made with the same settings, got .*"
         (lambda text: "[" * 10**6, WROTE + "nested too deeply"),
         (lambda text: text[:-30], WROTE + "line"),
         (lambda text: text.replace('"lost": 0', '"lost": NaN', 1), WROTE + "NaN is no JSON number"),
-        (lambda text: text.replace('"lost"', '"lost": 0, "lost"', 1), WROTE + "'lost' stands twice"),
+        (
+            lambda text: text.replace('"lost"', '"lost": 0, "lost"', 1),
+            WROTE + "'lost' stands twice",
+        ),
         (changed("slices", 1, value=...), WROTE + "it was changed since, or damaged"),
         (changed("slices", 1, "returns", 0, 1, value=0.75), WROTE + "it was changed since"),
         (changed("slices", 1, "degree", value=7), WROTE + "it was changed since"),
-        (changed("slices", 1, "degree", value=True), WROTE + r"slices\[1\].degree must be an integer, is True"),
-        (changed("slices", 1, "degree", value="1"), WROTE + r"slices\[1\].degree must be an integer"),
+        (
+            changed("slices", 1, "degree", value=True),
+            WROTE + r"slices\[1\].degree must be an integer, is True",
+        ),
+        (
+            changed("slices", 1, "degree", value="1"),
+            WROTE + r"slices\[1\].degree must be an integer",
+        ),
         (changed("slices", 1, "theta1", value=...), WROTE + r"slices\[1\] has no theta1"),
-        (changed("slices", 1, "returns", 0, value=[1.0]), WROTE + r"returns\[0\] must have 2 numbers"),
+        (
+            changed("slices", 1, "returns", 0, value=[1.0]),
+            WROTE + r"returns\[0\] must have 2 numbers",
+        ),
         (changed("slices", value={}), WROTE + "slices must be a list"),
         (changed("families", value=[]), WROTE + "it was changed since"),
         (changed("families", 0, "level", value=3), WROTE + "it was changed since"),
@@ -110,10 +126,22 @@ SETTINGS = "store must have been made with the same settings, got .*"
         (forged("settings", value={}), SETTINGS + "with dpend_version None"),
         (forged("settings", "more", value=1), SETTINGS + "with more 1"),
         (forged("slices", 0, value=...), WROTE + r"slices\[0\].theta1 is 0.78"),
-        (forged("slices", 1, "theta1", value=0.1), WROTE + r"slices\[1\].theta1 is 0.1, which is not the next one"),
-        (forged("slices", 1, "motions", value=-1), WROTE + r"slices\[1\].motions must be at least 0"),
-        (forged("slices", 1, "returns", 0, value=[0.1, 9.0]), WROTE + r"slices\[1\].returns has \(0.1, 9\)"),
-        (forged("families", 0, "seed", value=[1.0, 1.0, 0.5]), WROTE + r"families\[0\] begins at none"),
+        (
+            forged("slices", 1, "theta1", value=0.1),
+            WROTE + r"slices\[1\].theta1 is 0.1, which is not the next one",
+        ),
+        (
+            forged("slices", 1, "motions", value=-1),
+            WROTE + r"slices\[1\].motions must be at least 0",
+        ),
+        (
+            forged("slices", 1, "returns", 0, value=[0.1, 9.0]),
+            WROTE + r"slices\[1\].returns has \(0.1, 9\)",
+        ),
+        (
+            forged("families", 0, "seed", value=[1.0, 1.0, 0.5]),
+            WROTE + r"families\[0\] begins at none",
+        ),
         (forged("families", 0, "level", value=99), WROTE + r"families\[0\] begins at none"),
     ],
 )
@@ -128,12 +156,16 @@ def test_a_damaged_store_is_refused(paper, kept, tmp_path, damage, said):
 
 def test_what_would_never_end_is_refused_before_it_begins(paper):
     """The number of motions grows exponentially: told from a few of them, within a second."""
-    with pytest.raises(ValueError, match="max_period must be so short that most_steps, 3e.08, are enough, got 15.8 s"):
+    with pytest.raises(
+        ValueError,
+        match="max_period must be so short that most_steps, 3e.08, are enough, got 15.8 s",
+    ):
         dpend.find_brake_families(paper, max_period=15.8)
     with pytest.raises(ValueError, match="most_steps must be a finite positive number"):
         dpend.find_brake_families(paper, max_period=0.6, most_steps=0)
     with pytest.raises(
-        ValueError, match=r"m1 and m2 must be within a factor of 1e30 of each other.* got 1e\+300 and 0.1"
+        ValueError,
+        match=r"m1 and m2 must be within a factor of 1e30 of each other.* got 1e\+300 and 0.1",
     ):
         dpend.find_brake_families(Pendulum(m1=1e300), max_period=1.0)
 
@@ -151,12 +183,18 @@ def test_a_search_that_ran_out_of_steps_says_so_and_goes_on(paper, tmp_path):
         some.save(tmp_path / f"some.{ending}")
         assert dpend.load_atlas(tmp_path / f"some.{ending}").coverage == some.coverage
     whole = dpend.find_brake_families(paper, max_period=0.6, store=store)
-    assert (whole.coverage.exhausted, whole.coverage.slices, whole.coverage.suspicious_cells) == (False, 31, 0)
+    assert (whole.coverage.exhausted, whole.coverage.slices, whole.coverage.suspicious_cells) == (
+        False,
+        31,
+        0,
+    )
 
 
 @slow
 def test_two_searches_with_one_store(paper, tmp_path):
-    """Each slice of one is followed by one of the other: both are whole, and so is the store at any time."""
+    """Each slice of one is followed by one of the other: both are whole, and so is the store at any
+    time.
+    """
     store, turns = tmp_path / "search.json", []
 
     def other(done, planned, families):
@@ -166,17 +204,30 @@ def test_two_searches_with_one_store(paper, tmp_path):
 
     one = dpend.find_brake_families(paper, max_period=0.6, store=store, progress=other)
     for found in [one, *turns[1::2]]:
-        assert (found.coverage.slices, found.coverage.suspicious_cells, len(found)) == (31, 0, len(one))
+        assert (found.coverage.slices, found.coverage.suspicious_cells, len(found)) == (
+            31,
+            0,
+            len(one),
+        )
     again = dpend.find_brake_families(paper, max_period=0.6, store=store)
     np.testing.assert_array_equal(again.table["theta2"], one.table["theta2"])
 
 
 @slow
 def test_families_that_begin_in_equilibrium_have_its_period(square, paper):
-    """C1 and C4 the modes of the hanging pendulum; C2 and C3 the one oscillation of each saddle with a rod upright."""
+    """C1 and C4 the modes of the hanging pendulum; C2 and C3 the one oscillation of each saddle
+    with a rod upright.
+    """
     slow, fast = dpend.normal_modes(paper)
-    lower_up, upper_up = (np.max(np.imag(rates)) for rates in dpend.equilibria(paper).exponents[1:3])
-    periods = {"C1": fast.period, "C4": slow.period, "C2": 2 * np.pi / lower_up, "C3": 2 * np.pi / upper_up}
+    lower_up, upper_up = (
+        np.max(np.imag(rates)) for rates in dpend.equilibria(paper).exponents[1:3]
+    )
+    periods = {
+        "C1": fast.period,
+        "C4": slow.period,
+        "C2": 2 * np.pi / lower_up,
+        "C3": 2 * np.pi / upper_up,
+    }
     families = {one["family"]: one for one in square.families}
     assert set(families) == {"C1", "C2", "C3", "C4", "B1"}
     for name, period in periods.items():
@@ -195,7 +246,9 @@ def test_the_catalogue_accounts_for_itself(square):
     for one in square.families:
         rows = square.where(family=one["family"]).table
         assert np.all(np.diff(rows["arclength"]) > 0)
-        assert one["shortest_period_s"] <= rows["period"].min() < one["shortest_period_s"] * (1 + 1e-4)
+        assert (
+            one["shortest_period_s"] <= rows["period"].min() < one["shortest_period_s"] * (1 + 1e-4)
+        )
         assert rows["period"].max() == one["longest_period_s"]
         np.testing.assert_allclose(rows["period"].max(), LONGEST, rtol=1e-12)
         assert set(rows["symmetry"].tolist()) == {one["symmetry"]}
@@ -210,15 +263,21 @@ def test_rows_are_orbits(square, paper):
         assert max(orbit.error_estimate) < 1e-9
         end = dpend.reference(paper, orbit.state, [orbit.period / 2], error=False).state
         states = np.stack(jax.tree.leaves(end))[:, 0]
-        np.testing.assert_allclose(states[:2], [orbit.dual.theta1, orbit.dual.theta2], atol=1e-11 * growth)
+        np.testing.assert_allclose(
+            states[:2], [orbit.dual.theta1, orbit.dual.theta2], atol=1e-11 * growth
+        )
         np.testing.assert_allclose(states[2:], 0, atol=1e-12 * growth)
-        np.testing.assert_allclose((np.trace(monodromy(orbit, 1.0)) - 2) / 2, orbit.kappa, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            (np.trace(monodromy(orbit, 1.0)) - 2) / 2, orbit.kappa, rtol=1e-6, atol=1e-6
+        )
 
 
 @slow
 @pytest.mark.parametrize("theta1", [23.0, 77.7, -111.0, 166.0])
 def test_orbits_of_one_angle_lie_on_families(square, paper, theta1):
-    """Between the rows of a family, its dual curve or their mirror images, none of which are far apart."""
+    """Between the rows of a family, its dual curve or their mirror images, none of which are far
+    apart.
+    """
     table = square.table
     found = dpend.find_brake_orbits(paper, theta1=np.radians(theta1), max_period=LONGEST)
     assert len(found) > 0
@@ -227,7 +286,10 @@ def test_orbits_of_one_angle_lie_on_families(square, paper, theta1):
         for sign in (1, -1):
             for rest in ("", "dual_"):
                 apart = np.stack(
-                    [sign * table[f"{rest}theta{i}"] - x for i, x in ((1, np.radians(theta1)), (2, theta2))]
+                    [
+                        sign * table[f"{rest}theta{i}"] - x
+                        for i, x in ((1, np.radians(theta1)), (2, theta2))
+                    ]
                 )
                 apart -= 2 * np.pi * np.round(apart / (2 * np.pi))
                 away.append(np.min(np.hypot(np.hypot(*apart), np.log(table["period"] / period))))
@@ -236,7 +298,9 @@ def test_orbits_of_one_angle_lie_on_families(square, paper, theta1):
 
 @slow
 def test_a_search_that_was_stopped_goes_on(square, paper, tmp_path):
-    """Killed after the fifth slice, which the store has: the same atlas, and no slice scanned twice."""
+    """Killed after the fifth slice, which the store has: the same atlas, and no slice scanned
+    twice.
+    """
     store, calls = tmp_path / "search.json", []
 
     def stop(done, planned, families):
@@ -271,7 +335,9 @@ def test_names_do_not_depend_on_the_longest_period(square, paper):
 @slow
 def test_thirteen_families_within_two_seconds(paper):
     found = dpend.find_brake_families(paper, max_period=2.0)
-    assert [one["family"] for one in found.families if one["symmetry"] == "centred"] == [f"C{i}" for i in range(1, 8)]
+    assert [one["family"] for one in found.families if one["symmetry"] == "centred"] == [
+        f"C{i}" for i in range(1, 8)
+    ]
     assert len(found.families) == 13
     assert (found.coverage.suspicious_cells, found.coverage.degree) == (0, found.coverage.winding)
 

@@ -1,4 +1,6 @@
-"""Every hard case of experiments/hard_cases.py, with shorter motions, holds; and the page says what its table says."""
+"""Every hard case of experiments/hard_cases.py, with shorter motions, holds; and the page says what
+its table says.
+"""
 
 import csv
 from pathlib import Path
@@ -26,9 +28,13 @@ def test_it_holds(case):
 
 
 def test_extended_precision_is():
-    """Energy after half a second of a chaotic motion, in long double, and the same with other steps."""
+    """Energy after half a second of a chaotic motion, in long double, and the same with other
+    steps.
+    """
     pendulum, start = (0.2, 0.2, 0.1, 0.1, 9.8), (2.9, 3.1, 0.0, 0.0)
-    one, other = (extended.motion(pendulum, start, [0.5], longest=step)[0] for step in (0.005, 0.002))
+    one, other = (
+        extended.motion(pendulum, start, [0.5], longest=step)[0] for step in (0.005, 0.002)
+    )
     assert one.dtype == np.longdouble
     assert np.max(np.abs(one - other)) < 1e-14
 

@@ -97,8 +97,12 @@ def test_somersaults_to_the_printed_digit():
 
 def test_a_verdict_by_the_printed_digits():
     assert numbers.judged("1.2", 1.21, 1.2128, "") == numbers.CONFIRMED
-    assert numbers.judged("0.31", 0.3148, 0.3151, "pi").startswith(numbers.ONLY_PRINTED + ": 0.3151 rounds to 0.32; pi")
-    assert numbers.judged("1.25", 1.2552, 1.2553, "").startswith(numbers.DIFFERS + ": 1.2553 rounds to 1.26")
+    assert numbers.judged("0.31", 0.3148, 0.3151, "pi").startswith(
+        numbers.ONLY_PRINTED + ": 0.3151 rounds to 0.32; pi"
+    )
+    assert numbers.judged("1.25", 1.2552, 1.2553, "").startswith(
+        numbers.DIFFERS + ": 1.2553 rounds to 1.26"
+    )
     assert numbers.judged("64.3", 64.3755, 64.3428, "").startswith(numbers.DIFFERS)
 
 
@@ -119,7 +123,9 @@ def test_every_verdict_and_the_committed_table():
             expected = numbers.DIFFERS
         assert claim.verdict.partition(":")[0] == expected, key
         assert row["verdict"].partition(":")[0] == expected, key
-        if claim.quantity == "lambda, converged":  # chaotic for hours: another processor, another motion
+        if (
+            claim.quantity == "lambda, converged"
+        ):  # chaotic for hours: another processor, another motion
             assert abs(claim.true - 2.28) < 0.06
             continue
         known = KNOWN.get(key, (None, None))
@@ -154,4 +160,6 @@ def test_the_script_draws(tmp_path):
         "paper.pdf",
     ]
     with (tmp_path / "claims.csv").open() as file:
-        assert [row["quantity"] for row in csv.DictReader(file)] == [claim.quantity for claim in numbers.claims()]
+        assert [row["quantity"] for row in csv.DictReader(file)] == [
+            claim.quantity for claim in numbers.claims()
+        ]

@@ -1,4 +1,6 @@
-"""Designs against scaling laws, exact ratios, brute force, the full monodromy matrix and diffrax."""
+"""Designs against scaling laws, exact ratios, brute force, the full monodromy matrix and
+diffrax.
+"""
 
 import itertools
 from dataclasses import replace
@@ -48,7 +50,9 @@ def design(loss, pendulum, *free, branch="in-phase", theta1=SIXTY, **settings):
     found = dpend.design_pendulum(loss, pendulum, free, branch=branch, theta1=theta1, **settings)
     assert found.status == Status.CONVERGED, found.message
     for orbit in found.orbits:
-        back = dpend.reference(found.pendulum, orbit.state, [float(orbit.period)], error=False).state
+        back = dpend.reference(
+            found.pendulum, orbit.state, [float(orbit.period)], error=False
+        ).state
         missed = max(abs(back.theta1[0] - orbit.theta1), abs(back.theta2[0] - orbit.theta2))
         assert missed < 1e-10 * max(1.0, abs(orbit.kappa))
     return found
@@ -66,7 +70,10 @@ def full_kappa(found):
 
 def logs(found, start):
     """ln(found/start) of the pendulum's parameters."""
-    return {name: float(np.log(getattr(found.pendulum, name) / getattr(start, name))) for name in PARAMETERS[:-1]}
+    return {
+        name: float(np.log(getattr(found.pendulum, name) / getattr(start, name)))
+        for name in PARAMETERS[:-1]
+    }
 
 
 def test_gravity_for_a_second_scales_exactly(paper):
@@ -75,7 +82,9 @@ def test_gravity_for_a_second_scales_exactly(paper):
     np.testing.assert_allclose(found.pendulum.g, 9.8 * before.period**2, rtol=1e-13)
     np.testing.assert_allclose(found.distance, 2 * np.log(before.period), rtol=1e-12)
     assert abs(found.loss) < 1e-14
-    np.testing.assert_allclose([found.orbit.theta2, found.orbit.kappa], [before.theta2, before.kappa], rtol=1e-11)
+    np.testing.assert_allclose(
+        [found.orbit.theta2, found.orbit.kappa], [before.theta2, before.kappa], rtol=1e-11
+    )
     rates = found.sensitivities["period"]
     sums = [rates["l1"] + rates["l2"], rates["g"], rates["m1"] + rates["m2"]]
     np.testing.assert_allclose(sums, [0.5, -0.5, 0.0], atol=1e-12)
@@ -158,7 +167,12 @@ def test_the_nearest_of_several_by_brute_force(paper):
     for one, other in (("l1", "l2"), ("m1", "m2")):
         found = design(kappa, paper, one, other)
         start = getattr(paper, one)
-        ratios = roots(lambda x, n=one, s=start: float(find(replace(paper, **{n: s * np.exp(x)})).kappa), -2, 2, 41)
+        ratios = roots(
+            lambda x, n=one, s=start: float(find(replace(paper, **{n: s * np.exp(x)})).kappa),
+            -2,
+            2,
+            41,
+        )
         np.testing.assert_allclose(found.distance, min(np.abs(ratios)) / np.sqrt(2), rtol=1e-9)
     found = design(kappa, paper, "theta1", "l1")
     assert abs(found.distance - 0.630705) < 1e-6
@@ -166,7 +180,10 @@ def test_the_nearest_of_several_by_brute_force(paper):
     for log in np.arange(-0.6, 0.65, 0.05):
         angle = SIXTY * np.exp(log)
         for x in roots(
-            lambda x, a=angle: float(find(replace(paper, l1=0.2 * np.exp(x)), theta1=a).kappa), -0.9, 0.9, 13
+            lambda x, a=angle: float(find(replace(paper, l1=0.2 * np.exp(x)), theta1=a).kappa),
+            -0.9,
+            0.9,
+            13,
         ):
             nearest = min(nearest, float(np.hypot(x, log)))
     assert 0 <= nearest - found.distance < 2e-3
@@ -197,7 +214,15 @@ def test_equal_periods_at_two_angles(paper):
     def isochronous(wide, small):
         return wide.period - small.period
 
-    found = design(isochronous, paper, "l1", "l2", "m2", branch=("in-phase", "in-phase"), theta1=(SIXTY, np.radians(6)))
+    found = design(
+        isochronous,
+        paper,
+        "l1",
+        "l2",
+        "m2",
+        branch=("in-phase", "in-phase"),
+        theta1=(SIXTY, np.radians(6)),
+    )
     assert found.orbits[0].theta1 == SIXTY
     periods = [find(found.pendulum, theta1=np.radians(angle)).period for angle in (60, 6)]
     np.testing.assert_allclose(periods[0], periods[1], rtol=1e-12)
@@ -207,7 +232,9 @@ def test_bounds_hold(paper):
     found = design(one_second, paper, "l1", "l2", bounds={"l1": (0.15, 0.25)})
     assert found.at_bounds == ("l1",)
     np.testing.assert_allclose(found.pendulum.l1, 0.15, rtol=1e-15)
-    length = brentq(lambda l2: float(find(replace(paper, l1=0.15, l2=l2)).period) - 1, 0.05, 0.2, xtol=1e-14)
+    length = brentq(
+        lambda l2: float(find(replace(paper, l1=0.15, l2=l2)).period) - 1, 0.05, 0.2, xtol=1e-14
+    )
     np.testing.assert_allclose(found.pendulum.l2, length, rtol=1e-11)
 
 
@@ -223,14 +250,21 @@ def test_bounds_without_a_solution(paper):
 @pytest.mark.slow
 def test_equations_without_a_solution(paper):
     never = dpend.design_pendulum(
-        lambda orbit: orbit.kappa + 2, paper, "m2", branch="in-phase", theta1=SIXTY, bounds={"m2": (0.05, 0.2)}
+        lambda orbit: orbit.kappa + 2,
+        paper,
+        "m2",
+        branch="in-phase",
+        theta1=SIXTY,
+        bounds={"m2": (0.05, 0.2)},
     )
     assert never.status == Status.NO_SOLUTION  # of a centred orbit kappa is never below -1
     np.testing.assert_allclose(never.loss, 1.0, atol=1e-9)
 
 
 def test_a_minimum_is_found_and_stopped_by_bounds(paper):
-    """A bowl in the logarithms, whose lowest point is known, with and without a bound on the way."""
+    """A bowl in the logarithms, whose lowest point is known, with and without a bound on the
+    way.
+    """
 
     def bowl(orbit):
         x, y = jnp.log(orbit.pendulum.l1 / 0.3), jnp.log(orbit.pendulum.l2 / 0.1)
@@ -257,13 +291,18 @@ def test_sensitivities_are_those_of_orbits_solved_again(paper):
 
     def known(name, factor):
         here = values | {name: float(values[name]) * factor}
-        orbit = find(Pendulum(*(float(here[key]) for key in PARAMETERS[:-1])), theta1=here["theta1"])
+        orbit = find(
+            Pendulum(*(float(here[key]) for key in PARAMETERS[:-1])), theta1=here["theta1"]
+        )
         return np.array([orbit.theta2, orbit.period, orbit.kappa, orbit.period - 1.0])
 
     for name in PARAMETERS:
         numeric = (known(name, np.exp(1e-4)) - known(name, np.exp(-1e-4))) / 2e-4
         table = found.sensitivities
-        exact = [*(table[key][name] for key in ("theta2", "period", "kappa")), table["loss"][name][0]]
+        exact = [
+            *(table[key][name] for key in ("theta2", "period", "kappa")),
+            table["loss"][name][0],
+        ]
         np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-7)
 
 
@@ -275,7 +314,9 @@ def test_one_program_serves_all_branches_and_freedoms(paper):
 
 
 def test_failures_are_statuses(paper):
-    few = dpend.design_pendulum(second_and_kappa, paper, branch="in-phase", theta1=SIXTY, max_iterations=1)
+    few = dpend.design_pendulum(
+        second_and_kappa, paper, branch="in-phase", theta1=SIXTY, max_iterations=1
+    )
     assert few.status == Status.MAX_ITERATIONS
     assert "start from" in few.message
     poisoned = dpend.design_pendulum(
@@ -293,11 +334,20 @@ def test_failures_are_statuses(paper):
         ({"free": ("l1", "l9")}, "free must name one or more of l1, l2, m1, m2, g, theta1, got"),
         ({"free": ()}, "free must name one or more"),
         ({"free": ("l1", "l1")}, "free must name each parameter once"),
-        ({"loss": second_and_kappa, "free": "l1"}, "free must name as many parameters as there are equations or more"),
-        ({"loss": second_and_kappa, "goal": "minimum"}, "loss must be a scalar for a minimum, got 2 values"),
+        (
+            {"loss": second_and_kappa, "free": "l1"},
+            "free must name as many parameters as there are equations or more",
+        ),
+        (
+            {"loss": second_and_kappa, "goal": "minimum"},
+            "loss must be a scalar for a minimum, got 2 values",
+        ),
         ({"loss": 1.0}, "loss must be a function of an orbit"),
         ({"goal": "least"}, "goal must be one of zero, minimum, got 'least'"),
-        ({"bounds": {"l1": (0.3, 0.5)}}, "bounds of l1 must be two numbers with the start, 0.2, between them"),
+        (
+            {"bounds": {"l1": (0.3, 0.5)}},
+            "bounds of l1 must be two numbers with the start, 0.2, between them",
+        ),
         ({"bounds": {"l1": (0.5, 0.1)}}, "bounds of l1 must be two numbers with the start"),
         ({"bounds": {"l1": (-0.1, 0.5)}}, "bounds of l1 must be a finite positive number"),
         ({"bounds": {"l1": 0.5}}, r"bounds of l1 must be a pair \(low, high\), got 0.5"),
@@ -309,13 +359,21 @@ def test_failures_are_statuses(paper):
         ({"theta1": -1.0}, "theta1 must be between 0 and pi"),
         ({"theta1": "60"}, "theta1 must be a finite number"),
         ({"theta1": (0.5, 0.6)}, "theta1 must be one angle, or one a branch, got 2 for 1"),
-        ({"branch": ("in-phase",) * 2, "theta1": (0.5, 0.6), "free": "theta1"}, "theta1 can be free only if"),
+        (
+            {"branch": ("in-phase",) * 2, "theta1": (0.5, 0.6), "free": "theta1"},
+            "theta1 can be free only if",
+        ),
         ({"pendulum": Pendulum(g=-9.8)}, "g must be positive"),
         ({"pendulum": 0.2}, "pendulum must be a Pendulum"),
         ({"max_iterations": 0}, "max_iterations must be an integer of at least 1"),
     ],
 )
 def test_bad_requests_are_refused(paper, settings, text):
-    request = {"loss": one_second, "pendulum": paper, "branch": "in-phase", "theta1": SIXTY} | settings
+    request = {
+        "loss": one_second,
+        "pendulum": paper,
+        "branch": "in-phase",
+        "theta1": SIXTY,
+    } | settings
     with pytest.raises(ValueError, match=text):
         dpend.design_pendulum(**request)

@@ -1,4 +1,6 @@
-"""Fits against the pendulum that made the data, against scipy on other equations, and against what cannot be known."""
+"""Fits against the pendulum that made the data, against scipy on other equations, and against what
+cannot be known.
+"""
 
 import json
 from dataclasses import replace
@@ -25,7 +27,9 @@ FINE = 16  # saved states from frame to frame
 
 
 def motion(pendulum, theta1, theta2):
-    """Both angles [rad] of a release [deg] from rest over 20 s, at 960 times a second; one compiled program for all."""
+    """Both angles [rad] of a release [deg] from rest over 20 s, at 960 times a second; one compiled
+    program for all.
+    """
     release = dpend.released(*np.radians([theta1, theta2]))
     found = dpend.simulate(pendulum, release, 20.0, step=1 / (60 * FINE), error=False)
     return np.stack([found.state.theta1, found.state.theta2])
@@ -37,13 +41,17 @@ def noisy(angles, seed, noise=HALF):
 
 def off(pendulum, l2=1.25, m2=0.8, g=1.2):
     """A guess that is off by so much."""
-    return replace(pendulum, l2=float(pendulum.l2 * l2), m2=float(pendulum.m2 * m2), g=float(pendulum.g * g))
+    return replace(
+        pendulum, l2=float(pendulum.l2 * l2), m2=float(pendulum.m2 * m2), g=float(pendulum.g * g)
+    )
 
 
 def scores(fit, pendulum):
     """The errors of the three ratios over their standard errors."""
     true = (pendulum.l2 / pendulum.l1, pendulum.m2 / pendulum.m1, pendulum.g / pendulum.l1)
-    return np.array([(fit.estimates[k] - t) / fit.standard_errors[k] for k, t in zip(RATIOS, true, strict=True)])
+    return np.array(
+        [(fit.estimates[k] - t) / fit.standard_errors[k] for k, t in zip(RATIOS, true, strict=True)]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +76,16 @@ def test_a_chaotic_motion_gives_the_pendulum_back(paper, chaos):
         assert fit.standard_errors["m2/m1"] < 2e-4
         np.testing.assert_allclose(fit.estimates["g"], fit.estimates["g/l1"] * 0.2, rtol=1e-14)
         drift = (np.asarray([fit.state.theta1, fit.state.theta2]) - np.radians([170, 180])).ravel()
-        assert np.all(np.abs(drift) < 4 * np.array([fit.standard_errors[k] for k in ("theta1", "theta2")]))
+        assert np.all(
+            np.abs(drift) < 4 * np.array([fit.standard_errors[k] for k in ("theta1", "theta2")])
+        )
 
 
 @pytest.mark.slow
 def test_a_hundred_trials(paper, chaos):
-    """95 of 100 within three standard errors, which scatter by one, and the noise as it was made."""
+    """95 of 100 within three standard errors, which scatter by one, and the noise as it was
+    made.
+    """
     fits = [trial(paper, chaos, seed) for seed in range(100)]
     assert all(fit.status == Status.CONVERGED for fit in fits)
     z = np.array([scores(fit, paper) for fit in fits])
@@ -91,7 +103,10 @@ def test_wrapped_and_mirrored_angles_give_the_same(paper, chaos):
     mirrored = fit_parameters(times, *-data, pendulum=guess)
     for other in (wrapped, mirrored):
         for name in RATIOS:
-            assert abs(other.estimates[name] - plain.estimates[name]) < 1e-3 * plain.standard_errors[name]
+            assert (
+                abs(other.estimates[name] - plain.estimates[name])
+                < 1e-3 * plain.standard_errors[name]
+            )
     np.testing.assert_allclose(mirrored.theta2, -plain.theta2, atol=1e-4)
     # The fitted motion tumbles on, whatever turn the data are in.
     assert np.ptp(np.asarray(wrapped.theta2)) > 10
@@ -102,7 +117,9 @@ def test_data_without_noise_give_every_digit(paper, chaos):
     fit = fit_parameters(FRAMES[:121], *chaos[:, :121], pendulum=off(paper))
     assert fit.status == Status.CONVERGED
     np.testing.assert_allclose([fit.estimates[k] for k in RATIOS], [1, 1, 49], rtol=1e-10)
-    np.testing.assert_allclose([fit.state.theta1, fit.state.theta2], np.radians([170, 180]), atol=1e-10)
+    np.testing.assert_allclose(
+        [fit.state.theta1, fit.state.theta2], np.radians([170, 180]), atol=1e-10
+    )
     assert max(abs(float(fit.state.p1)), abs(float(fit.state.p2))) < 1e-10
 
 
@@ -116,11 +133,16 @@ def test_other_pendulums_at_irregular_times():
     assert np.max(np.abs(scores(fit, pendulum))) < 3
     # The same data, other fields free: the ratios are what is measured.
     other = fit_parameters(
-        times, *noisy(angles, 2), pendulum=replace(pendulum, l1=0.26, m1=0.25), free=("l1", "l2", "m1")
+        times,
+        *noisy(angles, 2),
+        pendulum=replace(pendulum, l1=0.26, m1=0.25),
+        free=("l1", "l2", "m1"),
     )
     for name in RATIOS:
         assert abs(other.estimates[name] - fit.estimates[name]) < 1e-2 * fit.standard_errors[name]
-        np.testing.assert_allclose(other.standard_errors[name], fit.standard_errors[name], rtol=1e-3)
+        np.testing.assert_allclose(
+            other.standard_errors[name], fit.standard_errors[name], rtol=1e-3
+        )
 
 
 def test_a_release_from_rest_tells_more(paper, chaos):
@@ -135,7 +157,9 @@ def test_a_release_from_rest_tells_more(paper, chaos):
 
 @pytest.mark.slow
 def test_least_squares_by_scipy_agree():
-    """Swings of 1 s, shot at in one piece with DOP853 and the equations of motion written by hand."""
+    """Swings of 1 s, shot at in one piece with DOP853 and the equations of motion written by
+    hand.
+    """
     pendulum, times = Pendulum(), np.linspace(0.0, 1.0, 61)
     data = noisy(motion(pendulum, 50, 20)[:, : 61 * FINE : FINE], 5)
     fit = fit_parameters(times, *data, pendulum=off(pendulum), noise=HALF)
@@ -145,7 +169,9 @@ def test_least_squares_by_scipy_agree():
 
         def slope(_, y):
             s, c = np.sin(y[0] - y[1]), np.cos(y[0] - y[1])
-            inertia = np.array([[1 + mass, mass * length * c], [mass * length * c, mass * length**2]])
+            inertia = np.array(
+                [[1 + mass, mass * length * c], [mass * length * c, mass * length**2]]
+            )
             force = [
                 -mass * length * s * y[3] ** 2 - (1 + mass) * gravity * np.sin(y[0]),
                 mass * length * s * y[2] ** 2 - mass * length * gravity * np.sin(y[1]),
@@ -156,9 +182,13 @@ def test_least_squares_by_scipy_agree():
         return ((y[:2] - data) / HALF).ravel()
 
     start = np.concatenate([np.log([1.0, 1.0, 49.0]), np.radians([50, 20]), [0, 0]])
-    best = least_squares(residuals, start, method="lm", x_scale=[0.1, 0.1, 0.1, 0.1, 0.1, 1, 1], xtol=1e-12)
+    best = least_squares(
+        residuals, start, method="lm", x_scale=[0.1, 0.1, 0.1, 0.1, 0.1, 1, 1], xtol=1e-12
+    )
     moves = 1e-3 * np.eye(7)
-    jacobian = np.array([residuals(best.x + move) - residuals(best.x - move) for move in moves]).T / 2e-3
+    jacobian = (
+        np.array([residuals(best.x + move) - residuals(best.x - move) for move in moves]).T / 2e-3
+    )
     units = np.concatenate([[0.2, 0.1, 0.2] * np.exp(best.x[:3]), np.ones(4)])
     covariance = np.linalg.inv(jacobian.T @ jacobian) * np.outer(units, units)
     ours = [fit.estimates[k] for k in ("l2", "m2", "g", "theta1", "theta2", "omega1", "omega2")]
@@ -195,7 +225,9 @@ def test_gaps(paper, chaos):
 )
 def test_one_rod_is_enough(paper, chaos, seen, frames):
     """The other is found from nothing: its motion, and with it the pendulum."""
-    data = [column if rod == seen else None for rod, column in enumerate(noisy(chaos, 1)[:, :frames])]
+    data = [
+        column if rod == seen else None for rod, column in enumerate(noisy(chaos, 1)[:, :frames])
+    ]
     fit = fit_parameters(FRAMES[:frames], *data, pendulum=off(paper, 1.2, 0.85, 1.15))
     assert fit.status == Status.CONVERGED
     assert np.max(np.abs(scores(fit, paper))) < 3
@@ -206,7 +238,9 @@ def test_one_rod_is_enough(paper, chaos, seen, frames):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factors", [(0.5, 2.0, 0.5), (2.0, 0.5, 2.0), (0.5, 0.5, 2.0), (2.0, 2.0, 0.5)])
+@pytest.mark.parametrize(
+    "factors", [(0.5, 2.0, 0.5), (2.0, 0.5, 2.0), (0.5, 0.5, 2.0), (2.0, 2.0, 0.5)]
+)
 def test_guesses_off_by_two(paper, chaos, factors):
     fit = fit_parameters(FRAMES, *noisy(chaos, 7), pendulum=off(paper, *factors))
     assert fit.status == Status.CONVERGED
@@ -243,7 +277,7 @@ def test_masses_lengths_frames_and_noise(pendulum, release, every, noise):
     np.testing.assert_allclose(np.degrees(fit.noise), noise, rtol=0.1)
 
 
-# --- what cannot be known, and what is not so ------------------------------------------------------------------------
+# --- what cannot be known, and what is not so -----------------------------------------------------
 
 
 @pytest.mark.slow
@@ -286,7 +320,11 @@ def test_a_wrong_clock_is_not_believed(paper, chaos):
     assert fit_parameters(times, *noisy(chaos, 0)[:, :400]).status == Status.MISFIT
 
 
-GOOD = np.linspace(0, 1, 31), 0.5 * np.cos(np.linspace(0, 5, 31)), 0.7 * np.cos(np.linspace(0, 5, 31))
+GOOD = (
+    np.linspace(0, 1, 31),
+    0.5 * np.cos(np.linspace(0, 5, 31)),
+    0.7 * np.cos(np.linspace(0, 5, 31)),
+)
 
 
 def changed(column, index, value):
@@ -298,7 +336,8 @@ def changed(column, index, value):
 @pytest.mark.parametrize(
     ("data", "options", "text"),
     [
-        (GOOD, {"free": ("l1", "l2", "g")}, "free must not hold l1, l2 and g: .* fix one of l1, l2, g"),
+        (GOOD, {"free": ("l1", "l2", "g")}, "free must not hold l1, l2 and g: .* fix one of l1, "
+                                            "l2, g"),
         (GOOD, {"free": ("m1", "m2")}, "free must not hold m1 and m2: .* fix one of m1, m2"),
         (GOOD, {"pendulum": 0.2}, "pendulum must be a Pendulum, got 0.2"),
         (GOOD, {"free": 5}, "free must hold each of l1, l2, m1, m2, g once at most, got 5"),
@@ -307,7 +346,8 @@ def changed(column, index, value):
         (GOOD, {"initial": (None, None)}, "initial must be theta1, theta2, omega1, omega2, got 2"),
         (GOOD, {"initial": (None, None, np.inf, 0)}, "initial omega1 must be a finite number"),
         (GOOD, {"noise": 0.0}, "noise must be a finite positive number"),
-        (changed(0, 7, 0.1), {}, r"times\[7\] must be later than the one before it, 0.2 s, got 0.1 s: sort"),
+        (changed(0, 7, 0.1), {}, r"times\[7\] must be later than the one before it, 0.2 s, got 0.1 "
+                                 r"s: sort"),
         (changed(0, 7, 0.2), {}, r"times\[7\] must be later"),
         (changed(0, 7, np.nan), {}, r"times\[7\] must be finite"),
         (changed(1, 7, np.inf), {}, r"theta1\[7\] must be finite \[rad\], got inf: give NaN"),
@@ -316,10 +356,16 @@ def changed(column, index, value):
         ((GOOD[0], "angles", None), {}, "theta1 must be numbers"),
         ([column[:5] for column in GOOD], {}, "times must be at least 7, got 5"),
         ((GOOD[0][:9], GOOD[1][:9], None), {}, "times must be more for 7 unknowns, got 9 angles"),
-        ((GOOD[0], GOOD[1], np.where(GOOD[0] < 0.1, GOOD[2], np.nan)), {}, "theta2 must be measured at least 7 times"),
-        ((GOOD[0], np.where(GOOD[0] > 0, GOOD[1], np.nan), None), {}, r"theta1\[0\] and theta2\[0\] are both missing"),
-        ((1000 * GOOD[0], GOOD[1], GOOD[2]), {}, "times must be at most .* s apart .* give seconds"),
-        ((GOOD[0], 60 * GOOD[1], None), {}, r"theta1\[\d+\] must be in radians and sampled often enough"),
+        ((GOOD[0], GOOD[1], np.where(GOOD[0] < 0.1, GOOD[2], np.nan)), {}, "theta2 must be "
+                                                                           "measured at least 7 "
+                                                                           "times"),
+        ((GOOD[0], np.where(GOOD[0] > 0, GOOD[1], np.nan), None), {}, r"theta1\[0\] and "
+                                                                      r"theta2\[0\] are both "
+                                                                      r"missing"),
+        ((1000 * GOOD[0], GOOD[1], GOOD[2]), {}, "times must be at most .* s apart .* give "
+                                                 "seconds"),
+        ((GOOD[0], 60 * GOOD[1], None), {}, r"theta1\[\d+\] must be in radians and sampled often "
+                                            r"enough"),
     ],
 )  # fmt: skip
 def test_refusals(data, options, text):
@@ -329,13 +375,17 @@ def test_refusals(data, options, text):
 
 def test_units_are_told_apart_by_the_equations(paper, chaos):
     slow = motion(paper, 3, 4)[:, ::FINE]  # slow enough for steps below a radian even in degrees
-    with pytest.raises(ValueError, match="must be in radians, got angles that obey .* only if they are in degrees"):
+    with pytest.raises(
+        ValueError, match="must be in radians, got angles that obey .* only if they are in degrees"
+    ):
         fit_parameters(FRAMES[:300], *np.degrees(slow[:, :300]))
-    with pytest.raises(ValueError, match="must be in radians, got angles that obey .* converted twice"):
+    with pytest.raises(
+        ValueError, match="must be in radians, got angles that obey .* converted twice"
+    ):
         fit_parameters(FRAMES[:300], *np.radians(noisy(chaos, 0)[:, :300]))
 
 
-# --- the command line ------------------------------------------------------------------------------------------------
+# --- the command line -----------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -353,7 +403,9 @@ def run(monkeypatch, capsys):
 @pytest.mark.slow
 def test_what_simulate_wrote_is_fitted(run, tmp_path):
     data = tmp_path / "motion.csv"
-    run("simulate", "--theta1", 100, "--theta2", 60, "--duration", 2, "--step", 0.005, "--out", data)
+    run(
+        "simulate", "--theta1", 100, "--theta2", 60, "--duration", 2, "--step", 0.005, "--out", data
+    )
     status, out, err = run("fit", data, "--l2", 0.25, "--m2", 0.08, "--json")
     assert (status, err) == (0, "")
     found = json.loads(out)
@@ -364,14 +416,40 @@ def test_what_simulate_wrote_is_fitted(run, tmp_path):
 def test_the_command(run, tmp_path, chaos):
     data, figure = tmp_path / "data.csv", tmp_path / "fit.png"
     rows = zip(FRAMES[:240], *np.degrees(noisy(chaos, 0)[:, :240]), strict=True)
-    data.write_text(HEADER + "".join(f"{t},{a},{'' if i % 9 == 5 else b}\n" for i, (t, a, b) in enumerate(rows)))
-    command = ("fit", data, "--l2", 0.25, "--m2", 0.08, "--free", "l2, m2,g", "--at-rest", "--noise", 0.5)
+    data.write_text(
+        HEADER + "".join(f"{t},{a},{'' if i % 9 == 5 else b}\n" for i, (t, a, b) in enumerate(rows))
+    )
+    command = (
+        "fit",
+        data,
+        "--l2",
+        0.25,
+        "--m2",
+        0.08,
+        "--free",
+        "l2, m2,g",
+        "--at-rest",
+        "--noise",
+        0.5,
+    )
     status, out, err = run(*command, "--json", "--figure", figure)
     assert (status, err) == (0, "")
     found = json.loads(out)
-    for name, true in (("l2_m", 0.2), ("m2_kg", 0.1), ("g_m_s2", 9.8), ("theta1_deg", 170), ("theta2_deg", 180)):
-        assert abs(found["estimates"][name] - true) < 3 * found["standard_errors"][name] < 0.03 * true
-    assert (found["status"], found["free"], found["estimates"]["omega1_deg_s"]) == ("converged", ["l2", "m2", "g"], 0.0)
+    for name, true in (
+        ("l2_m", 0.2),
+        ("m2_kg", 0.1),
+        ("g_m_s2", 9.8),
+        ("theta1_deg", 170),
+        ("theta2_deg", 180),
+    ):
+        assert (
+            abs(found["estimates"][name] - true) < 3 * found["standard_errors"][name] < 0.03 * true
+        )
+    assert (found["status"], found["free"], found["estimates"]["omega1_deg_s"]) == (
+        "converged",
+        ["l2", "m2", "g"],
+        0.0,
+    )
     assert figure.stat().st_size > 10_000
     status, out, _ = run(*command)
     assert status == 0
@@ -391,17 +469,29 @@ def altered(row, text):
     ("text", "message"),
     [
         ("", "must have a header and rows, got an empty file"),
-        ("time_s,theta1_rad\n0,1\n", "must have a column theta1_deg or theta2_deg, got time_s, theta1_rad"),
-        (HEADER.replace("time_s", "t") + "".join(ROWS), "must have a column time_s, got t, theta1_deg, theta2_deg"),
+        (
+            "time_s,theta1_rad\n0,1\n",
+            "must have a column theta1_deg or theta2_deg, got time_s, theta1_rad",
+        ),
+        (
+            HEADER.replace("time_s", "t") + "".join(ROWS),
+            "must have a column time_s, got t, theta1_deg, theta2_deg",
+        ),
         (altered(5, "0.1,forty,3\n"), "theta1_deg in row 5 of"),
         (altered(5, "0.1,3,nan\n"), "theta2_deg in row 5 of"),
         (altered(5, "0.1,inf,3\n"), "must be a finite number, got 'inf': leave the cell empty"),
         (altered(5, ",1,3\n"), "time_s in row 5 of"),
         (altered(5, "0.1,3\n"), "row 5 of"),
         (altered(6, ROWS[3]), "time_s in row 6 of"),
-        (altered(6, "0.05,1,2\n"), "must be later than the one before it, 0.1 s, got 0.05 s: sort the samples"),
+        (
+            altered(6, "0.05,1,2\n"),
+            "must be later than the one before it, 0.1 s, got 0.05 s: sort the samples",
+        ),
         (HEADER + "".join(ROWS[:4]), "times must be at least 7, got 4"),
-        (HEADER + "".join(f"{t},{60 * np.degrees(a)},\n" for t, a, _ in zip(*GOOD, strict=True)), "theta1_deg in row "),
+        (
+            HEADER + "".join(f"{t},{60 * np.degrees(a)},\n" for t, a, _ in zip(*GOOD, strict=True)),
+            "theta1_deg in row ",
+        ),
     ],
 )
 def test_bad_files_are_refused_in_one_line(run, tmp_path, text, message):
@@ -419,7 +509,8 @@ def test_a_file_in_radians_is_refused(run, tmp_path, chaos):
     status, _, err = run("fit", data)
     assert status == 2
     assert (
-        "must be in degrees, got angles that obey the equations of a double pendulum only if they are in radians" in err
+        "must be in degrees, got angles that obey the equations of a double pendulum only if they "
+        "are in radians" in err
     )
     status, _, err = run("fit", tmp_path / "none.csv")
     assert (status, err.count("\n")) == (2, 1)
@@ -428,7 +519,10 @@ def test_a_file_in_radians_is_refused(run, tmp_path, chaos):
 
 def test_load_angles_leaves_out_what_is_not_there(tmp_path):
     data = tmp_path / "data.csv"
-    data.write_text("theta2_deg,other,time_s\n" + "".join(f"{'' if i == 3 else i},x,{i / 10}\n" for i in range(9)))
+    data.write_text(
+        "theta2_deg,other,time_s\n"
+        + "".join(f"{'' if i == 3 else i},x,{i / 10}\n" for i in range(9))
+    )
     times, theta1, theta2 = dpend.load_angles(data)
     np.testing.assert_allclose(times, np.arange(9) / 10)
     assert theta1 is None

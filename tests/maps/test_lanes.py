@@ -41,7 +41,9 @@ def test_number_of_lanes_does_not_change_a_bit(paper):
     whole = lanes.over_lanes(END, paper, releases())
     state = releases()
     for cells in (1, 64, 65, 131):
-        part = lanes.over_lanes(END, paper, jax.tree.map(lambda leaf, cells=cells: leaf[:cells], state))
+        part = lanes.over_lanes(
+            END, paper, jax.tree.map(lambda leaf, cells=cells: leaf[:cells], state)
+        )
         for key in whole:
             np.testing.assert_array_equal(part[key], whole[key][:cells])
 
@@ -64,7 +66,11 @@ def test_several_launches_come_back_in_order(paper, monkeypatch):
 
     def index(pendulum, state):
         traces.append(1)
-        return {"where": state.theta1, "number": state.theta2.astype(int), "even": state.theta2 % 2 == 0}
+        return {
+            "where": state.theta1,
+            "number": state.theta2.astype(int),
+            "even": state.theta2 % 2 == 0,
+        }
 
     numbers = np.arange(1000.0)
     out = lanes.over_lanes(index, paper, dpend.State(numbers / 7, numbers, numbers, numbers))
@@ -86,7 +92,9 @@ def test_long_motions_come_in_small_pieces(paper):
 
 
 def test_results_of_any_shape_come_lanes_last(paper):
-    """A table for each lane, beside a scalar; launches are then smaller, so that there are several."""
+    """A table for each lane, beside a scalar; launches are then smaller, so that there are
+    several.
+    """
     states = releases()
 
     def times_table(pendulum, x):

@@ -1,4 +1,6 @@
-"""Stores with every kind of damage: the map comes out as it was, or one line says why not; never another map."""
+"""Stores with every kind of damage: the map comes out as it was, or one line says why not; never
+another map.
+"""
 
 import concurrent.futures
 import contextlib
@@ -30,7 +32,11 @@ def cheap(pendulum, state, scheme):
 
 
 def contents(store):
-    return {path.relative_to(store): path.read_bytes() for path in sorted(store.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(store): path.read_bytes()
+        for path in sorted(store.rglob("*"))
+        if path.is_file()
+    }
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -63,7 +69,9 @@ def truth():
 
 
 def outcome(store, whole):
-    """ "told" or "silent" where the map is right and the files are what they were; or the line that refuses it."""
+    """ "told" or "silent" where the map is right and the files are what they were; or the line that
+    refuses it.
+    """
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         line = ""
@@ -81,13 +89,16 @@ def outcome(store, whole):
     for key, values in truth().items():
         np.testing.assert_array_equal(field[key].values, values)
     assert set(field.variables) == {*truth(), "theta1_deg", "theta2_deg"}
-    assert all(here == there for here, there in zip(contents(store).items(), contents(whole).items(), strict=True))
+    assert all(
+        here == there
+        for here, there in zip(contents(store).items(), contents(whole).items(), strict=True)
+    )
     assert all(issubclass(one.category, stores.StoreWarning) for one in heard)
     assert all(str(one.message).startswith(f"store {store} is damaged: ") for one in heard)
     return "told" if heard else "silent"
 
 
-# --- what happens to one file ---------------------------------------------------------------------------------------
+# --- what happens to one file ---------------------------------------------------------------------
 
 
 def truncate(share):
@@ -146,20 +157,35 @@ ON_FILES = {
     "last bit": flip_bit(1.0),
 }
 FILES = [
-    "zarr.json", "product/zarr.json", "status/zarr.json", "theta1/zarr.json", "theta2_deg/zarr.json",
-    "theta1/c/0", "theta2_deg/c/0", f"product/c/{TILE}", f"sum/c/{TILE}", f"status/c/{TILE}", f"status/sha256/{TILE}",
-]  # fmt: skip
+    "zarr.json",
+    "product/zarr.json",
+    "status/zarr.json",
+    "theta1/zarr.json",
+    "theta2_deg/zarr.json",
+    "theta1/c/0",
+    "theta2_deg/c/0",
+    f"product/c/{TILE}",
+    f"sum/c/{TILE}",
+    f"status/c/{TILE}",
+    f"status/sha256/{TILE}",
+]
 
 
 def same_document(file, before):
     """Whether a file of metadata still says the same: a bit of white space says nothing."""
     with contextlib.suppress(OSError, ValueError):
-        return file.is_file() and file.stat().st_size < 1e6 and json.loads(file.read_bytes()) == json.loads(before)
+        return (
+            file.is_file()
+            and file.stat().st_size < 1e6
+            and json.loads(file.read_bytes()) == json.loads(before)
+        )
     return False
 
 
 def check_damage(store, whole, kind, name):
-    """The map is mended, and that is told; only the description of the whole may be beyond mending."""
+    """The map is mended, and that is told; only the description of the whole may be beyond
+    mending.
+    """
     shutil.copytree(whole, store)
     ON_FILES[kind](store / name)
     if name.endswith("zarr.json") and same_document(store / name, (whole / name).read_bytes()):
@@ -183,7 +209,7 @@ def test_every_kind_of_damage_to_every_file(tmp_path, whole, name):
         check_damage(tmp_path / f"{index}.zarr", whole, kind, name)
 
 
-# --- what happens to a document -------------------------------------------------------------------------------------
+# --- what happens to a document -------------------------------------------------------------------
 
 TEXTS = {
     "null": b"null",
@@ -219,7 +245,11 @@ def test_a_document_is_another_thing(tmp_path, whole):
             store = shutil.copytree(whole, tmp_path / f"{index}{name[:3]}.zarr")
             (store / name).write_bytes(text)
             found = outcome(store, whole)
-            wanted = "told" if name != "zarr.json" else "store must be a Zarr store of a sweep or a new name"
+            wanted = (
+                "told"
+                if name != "zarr.json"
+                else "store must be a Zarr store of a sweep or a new name"
+            )
             assert found.startswith(wanted), f"{kind}: {found}"
 
 
@@ -229,7 +259,9 @@ def test_a_document_says_something_else(tmp_path, whole, name):
     document = json.loads((whole / name).read_bytes())
     texts = {}
     for key in document:
-        texts[f"without {key}"] = json.dumps({k: v for k, v in document.items() if k != key}).encode()
+        texts[f"without {key}"] = json.dumps(
+            {k: v for k, v in document.items() if k != key}
+        ).encode()
     for key, value in EDITS.items():
         if document.get(key, EDITS) == value:
             continue
@@ -238,7 +270,9 @@ def test_a_document_says_something_else(tmp_path, whole, name):
         store = shutil.copytree(whole, tmp_path / f"{index}.zarr")
         (store / name).write_bytes(text)
         found = outcome(store, whole)
-        assert found == "told" or (name == "zarr.json" and found.startswith("store ")), f"{kind}: {found}"
+        assert found == "told" or (name == "zarr.json" and found.startswith("store ")), (
+            f"{kind}: {found}"
+        )
 
 
 @pytest.mark.parametrize(
@@ -249,7 +283,11 @@ def test_a_document_says_something_else(tmp_path, whole, name):
         ("extra", 1, "holds another sweep, its extra is 1, not None"),
         ("dpend_version", "9.9", "was made by version 9.9 of dpend, this is"),
         ("dpend_version", None, "its zarr.json is no description of a sweep"),
-        ("coordinates", "theta1_deg", "its coordinates is 'theta1_deg', not 'theta1_deg theta2_deg'"),
+        (
+            "coordinates",
+            "theta1_deg",
+            "its coordinates is 'theta1_deg', not 'theta1_deg theta2_deg'",
+        ),
     ],
 )
 def test_an_attribute_of_the_sweep_is_edited(tmp_path, whole, key, value, text):
@@ -260,7 +298,7 @@ def test_an_attribute_of_the_sweep_is_edited(tmp_path, whole, key, value, text):
     assert text in outcome(store, whole)
 
 
-# --- what happens to several files, or through Zarr -----------------------------------------------------------------
+# --- what happens to several files, or through Zarr -----------------------------------------------
 
 
 def write_values(key, values):
@@ -338,7 +376,10 @@ ON_STORES = {
     "no coordinate": (remove("theta1"), "told"),
     "no array": (remove("sum"), "told"),
     "no status": (remove("status"), "told"),
-    "no digests": (remove("status/sha256"), "silent"),  # as of one that was stopped at its first tile
+    "no digests": (
+        remove("status/sha256"),
+        "silent",
+    ),  # as of one that was stopped at its first tile
     "no chunks": (remove("sum/c", "product/c"), "told"),
     "a file for an array": (replace_directory_by_file("sum"), "told"),
     "a file for chunks": (replace_directory_by_file("status/c"), "told"),
@@ -346,7 +387,10 @@ ON_STORES = {
     "a leftover": (add("zarr.1f.partial"), "silent"),
     "leftovers": (leave, "told"),
     "the lock is a link": (link_lock, "told"),
-    "an extra array": (add("more/zarr.json", "{}"), "holds more, which is no part of this sweep: move it elsewhere"),
+    "an extra array": (
+        add("more/zarr.json", "{}"),
+        "holds more, which is no part of this sweep: move it elsewhere",
+    ),
     "an extra file": (add("notes.txt"), "holds notes.txt, which is no part of this sweep"),
 }
 
@@ -360,7 +404,7 @@ def test_a_store_is_damaged(tmp_path, whole, kind):
     assert wanted in found
 
 
-# --- two at once ----------------------------------------------------------------------------------------------------
+# --- two at once ----------------------------------------------------------------------------------
 
 
 def stop(*numbers):
@@ -370,13 +414,21 @@ def stop(*numbers):
 def stopped(store):
     """A store of which one tile is done."""
     with contextlib.suppress(KeyboardInterrupt):
-        dpend.sweep(cheap, Pendulum(), AXES, store=store, progress=lambda done, *more: stop() if done > 4 else None)
+        dpend.sweep(
+            cheap,
+            Pendulum(),
+            AXES,
+            store=store,
+            progress=lambda done, *more: stop() if done > 4 else None,
+        )
     assert len(list(store.glob("status/c/*/*"))) == 1
     return store
 
 
 def test_of_two_writers_one_is_refused(tmp_path, whole):
-    """From another thread, while the first one works, once on a new store and once on a stopped one."""
+    """From another thread, while the first one works, once on a new store and once on a stopped
+    one.
+    """
     for store in (tmp_path / "new.zarr", stopped(tmp_path / "old.zarr")):
         refused = []
 
@@ -387,7 +439,10 @@ def test_of_two_writers_one_is_refused(tmp_path, whole):
                     refused.append(str(other.exception(60)))
 
         dpend.sweep(cheap, Pendulum(), AXES, store=store, progress=again)
-        wanted = f"store must not be written by two at once, got {store}, which another process or thread is writing"
+        wanted = (
+            f"store must not be written by two at once, got {store}, which another process or "
+            f"thread is writing"
+        )
         assert refused[0].startswith(wanted)
         assert contents(store) == contents(whole)
 
@@ -424,7 +479,7 @@ def test_no_warning_from_what_a_user_types(tmp_path, whole):
     assert int(np.sum(field.status.values != Status.NOT_COMPUTED)) == 4
 
 
-# --- where a store cannot be ----------------------------------------------------------------------------------------
+# --- where a store cannot be ----------------------------------------------------------------------
 
 
 def test_places_that_are_none(tmp_path, whole):
@@ -434,7 +489,10 @@ def test_places_that_are_none(tmp_path, whole):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     (tmp_path / "link").symlink_to(shutil.copytree(whole, tmp_path / "m.zarr"))
     for name in ("file", "empty", "nowhere", "loop"):
-        wanted = f"store must be a Zarr store of a sweep or a new name, got {tmp_path / name}: its zarr.json "
+        wanted = (
+            f"store must be a Zarr store of a sweep or a new name, got {tmp_path / name}: its "
+            f"zarr.json "
+        )
         assert outcome(tmp_path / name, whole).startswith(wanted)
     assert outcome(tmp_path / "link", whole) == "silent"
 
@@ -449,6 +507,7 @@ def test_a_disk_that_is_full(tmp_path, whole, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(stores.Store, "_write_chunk", full)
         assert outcome(store, whole).startswith(
-            f"store must be finished or one that can be written to, got {store} (No space left on device): give"
+            f"store must be finished or one that can be written to, got {store} (No space left on "
+            f"device): give"
         )
     assert outcome(store, whole) == "silent"

@@ -1,4 +1,6 @@
-"""The mechanics against the gradient of H, the Lagrangian, dense eigenvalues and limits known by hand."""
+"""The mechanics against the gradient of H, the Lagrangian, dense eigenvalues and limits known by
+hand.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +60,9 @@ def test_vector_field_is_the_gradient_of_the_hamiltonian(pendulum, theta1, theta
 def lagrangian(pendulum, angles, rates):
     (theta1, theta2), (omega1, omega2) = angles, rates
     v1, v2 = pendulum.l1 * omega1, pendulum.l2 * omega2
-    kinetic = 0.5 * pendulum.m1 * v1**2 + 0.5 * pendulum.m2 * (v1**2 + v2**2 + 2 * v1 * v2 * jnp.cos(theta1 - theta2))
+    kinetic = 0.5 * pendulum.m1 * v1**2 + 0.5 * pendulum.m2 * (
+        v1**2 + v2**2 + 2 * v1 * v2 * jnp.cos(theta1 - theta2)
+    )
     height1 = -pendulum.l1 * jnp.cos(theta1)
     height2 = height1 - pendulum.l2 * jnp.cos(theta2)
     return kinetic - pendulum.g * (pendulum.m1 * height1 + pendulum.m2 * height2)
@@ -77,7 +81,9 @@ def test_vector_field_is_the_euler_lagrange_equation(pendulum):
 
 
 def test_vector_field_is_the_papers():
-    """Yamaguchi's canonical equations (section 2, with the sign that its listing has), term by term."""
+    """Yamaguchi's canonical equations (section 2, with the sign that its listing has), term by
+    term.
+    """
     pendulum, state = Pendulum(0.3, 0.17, 0.05, 0.4, 3.0), State(0.9, -2.1, 0.02, -0.03)
     l1, l2, m1, m2, g = jax.tree.leaves(pendulum)
     mu, s, c = m2 / m1, np.sin(0.9 + 2.1), np.cos(0.9 + 2.1)
@@ -90,20 +96,30 @@ def test_vector_field_is_the_papers():
         force - (m1 + m2) * g * l1 * np.sin(0.9),
         -force - m2 * g * l2 * np.sin(-2.1),
     ]
-    np.testing.assert_allclose(jax.tree.leaves(dpend.vector_field(pendulum, state)), expected, rtol=1e-13)
+    np.testing.assert_allclose(
+        jax.tree.leaves(dpend.vector_field(pendulum, state)), expected, rtol=1e-13
+    )
 
 
 @settings(max_examples=40, deadline=None)
 @given(pendulums, angle, angle, st.floats(-3, 3), st.floats(-3, 3))
 def test_velocities_undo_momenta(pendulum, theta1, theta2, omega1, omega2):
     state = MOMENTA(pendulum, theta1, theta2, omega1, omega2)
-    scale = (abs(omega1) + abs(omega2)) * (1 + pendulum.m2 / pendulum.m1) * (1 + pendulum.l1 / pendulum.l2)
+    scale = (
+        (abs(omega1) + abs(omega2))
+        * (1 + pendulum.m2 / pendulum.m1)
+        * (1 + pendulum.l1 / pendulum.l2)
+    )
     scale *= 1 + pendulum.l2 / pendulum.l1
-    np.testing.assert_allclose(VELOCITIES(pendulum, state), (omega1, omega2), rtol=0, atol=1e-15 + 1e-14 * scale)
+    np.testing.assert_allclose(
+        VELOCITIES(pendulum, state), (omega1, omega2), rtol=0, atol=1e-15 + 1e-14 * scale
+    )
 
 
 def test_bob_energies_have_the_papers_zero_levels(paper):
-    """Section 4, case A: (0, 0.11) and (0, 0.22) J at the release, and all of them zero hanging at rest."""
+    """Section 4, case A: (0, 0.11) and (0, 0.22) J at the release, and all of them zero hanging at
+    rest.
+    """
     at_release = dpend.energies(paper, dpend.released(np.radians(64.3), np.radians(64.3)))
     np.testing.assert_allclose(at_release, (0, 0.11, 0, 0.22), atol=0.005)
     rise = 1 - np.cos(np.radians(64.3))
@@ -131,7 +147,9 @@ def test_exponents_are_the_eigenvalues_of_the_linear_flow(pendulum):
     found = EQUILIBRIA(pendulum)
     for i in range(4):
         state = jax.tree.map(lambda leaf, i=i: leaf[i], found.state)
-        squares = np.sort(np.linalg.eigvals(np.array(linearised(pendulum, state))).astype(complex) ** 2)
+        squares = np.sort(
+            np.linalg.eigvals(np.array(linearised(pendulum, state))).astype(complex) ** 2
+        )
         ours = np.sort(np.repeat(np.real(found.exponents[i] ** 2), 2))
         np.testing.assert_allclose(ours, squares.real, atol=1e-6 * np.abs(squares).max())
 
@@ -154,7 +172,9 @@ def test_normal_modes_of_the_paper(paper):
 @pytest.mark.parametrize("mass_ratio", [1e-12, 1e-6, 1e-3, 1.0, 1e3, 1e6])
 @pytest.mark.parametrize("length_ratio", [1e-3, 0.999, 1.0, 1.001, 1e3])
 def test_normal_modes_keep_their_digits(mass_ratio, length_ratio):
-    """(1 + mu)(L - l1)(L - l2) = mu l1 l2 for the length of the equivalent simple pendulum, in 50 digits."""
+    """(1 + mu)(L - l1)(L - l2) = mu l1 l2 for the length of the equivalent simple pendulum, in 50
+    digits.
+    """
     import mpmath
 
     slow, fast = MODES(Pendulum(1.0, length_ratio, 1.0, mass_ratio, 1.0))
@@ -185,7 +205,9 @@ def test_bad_numbers_are_refused():
 
 
 def test_arrays_are_numbers_too():
-    """Signs are looked at in arrays as well, integers and single precision become float64, NaN may stand for a cell."""
+    """Signs are looked at in arrays as well, integers and single precision become float64, NaN may
+    stand for a cell.
+    """
     for lengths in (
         np.array([0.2, -0.2]),
         jnp.array([0.2, 0.0]),
@@ -195,10 +217,15 @@ def test_arrays_are_numbers_too():
     ):
         with pytest.raises(ValueError, match="l1 must be a finite positive number .*, got"):
             Pendulum(l1=lengths)
-    pendulum = Pendulum(l1=np.array([1, 2]), l2=jnp.asarray([0.5, np.nan], jnp.float32), m1=np.float32(0.5), g=-1)
+    pendulum = Pendulum(
+        l1=np.array([1, 2]), l2=jnp.asarray([0.5, np.nan], jnp.float32), m1=np.float32(0.5), g=-1
+    )
     assert {leaf.dtype for leaf in jax.tree.leaves(pendulum)} == {np.dtype(float)}
     assert np.isnan(pendulum.l2[1])
-    with pytest.raises(ValueError, match=r"theta1, theta2, p1, p2 must have one shape, got \(3,\), \(2,\), \(\), \(\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"theta1, theta2, p1, p2 must have one shape, got \(3,\), \(2,\), \(\), \(\)",
+    ):
         State(np.zeros(3), np.zeros(2), 0.0, 0.0)
     assert State(np.zeros((3, 1)), np.zeros(2), 0.0, 0.0).theta1.shape == (3, 1)
     lost = State(jnp.asarray(jnp.nan), 0.0, 0.0, 0.0)  # the end of a motion that was lost is data
@@ -215,4 +242,6 @@ def test_transformations_pass_through_the_data_classes(paper):
     mask = jax.tree.map(lambda _: True, paper)
     assert mask.l1 is True
     slope = jax.grad(lambda p: dpend.normal_modes(p)[0].period)(paper)
-    np.testing.assert_allclose(slope.g, -0.5 * dpend.normal_modes(paper)[0].period / paper.g, rtol=1e-14)
+    np.testing.assert_allclose(
+        slope.g, -0.5 * dpend.normal_modes(paper)[0].period / paper.g, rtol=1e-14
+    )

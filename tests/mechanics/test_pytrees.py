@@ -1,4 +1,6 @@
-"""States and pendulums as trees: any leaf passes, and other libraries differentiate and fit them."""
+"""States and pendulums as trees: any leaf passes, and other libraries differentiate and fit
+them.
+"""
 
 import copy
 import pickle
@@ -55,19 +57,31 @@ def solution(adjoint, pendulum, start):
 
     term = diffrax.ODETerm(lambda t, state, pendulum: dpend.vector_field(pendulum, state))
     return diffrax.diffeqsolve(
-        term, diffrax.Dopri8(), 0.0, DURATION, DURATION / STEPS, start, pendulum, adjoint=adjoint, max_steps=STEPS + 4
+        term,
+        diffrax.Dopri8(),
+        0.0,
+        DURATION,
+        DURATION / STEPS,
+        start,
+        pendulum,
+        adjoint=adjoint,
+        max_steps=STEPS + 4,
     ).ys.theta2[-1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ForwardMode", "RecursiveCheckpointAdjoint", "DirectAdjoint", "BacksolveAdjoint"])
+@pytest.mark.parametrize(
+    "name", ["ForwardMode", "RecursiveCheckpointAdjoint", "DirectAdjoint", "BacksolveAdjoint"]
+)
 def test_diffrax_takes_the_vector_field_and_its_adjoints_agree(name):
     import diffrax
 
     pendulum, start = Pendulum(), jax.tree.map(jnp.asarray, START)
     pendulum = jax.tree.map(jnp.asarray, pendulum)
     transform = jax.jacfwd if name == "ForwardMode" else jax.grad
-    found = transform(lambda p, s: solution(getattr(diffrax, name)(), p, s), argnums=(0, 1))(pendulum, start)
+    found = transform(lambda p, s: solution(getattr(diffrax, name)(), p, s), argnums=(0, 1))(
+        pendulum, start
+    )
     expected = DERIVATIVE(pendulum, start)
     # rk4 at 60 steps is right to 1e-6 of each derivative.
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
@@ -87,7 +101,9 @@ def test_optax_recovers_a_length():
 
     pendulum = jax.tree.map(jnp.asarray, Pendulum())
     mask = [jnp.asarray(name == "l2", jnp.float64) for name in ("l1", "l2", "m1", "m2", "g")]
-    only_l2 = jax.tree.unflatten(jax.tree.structure(pendulum), mask)  # by hand no length may be zero
+    only_l2 = jax.tree.unflatten(
+        jax.tree.structure(pendulum), mask
+    )  # by hand no length may be zero
     method = optax.chain(optax.sgd(0.5), optax.scale(0.1))
     state = method.init(pendulum)
 
@@ -97,7 +113,9 @@ def test_optax_recovers_a_length():
         updates, state = method.update(slope, state, pendulum)
         return (optax.apply_updates(pendulum, updates), state), None
 
-    (pendulum, _), _ = jax.jit(lambda carry: jax.lax.scan(once, carry, None, length=400))((pendulum, state))
+    (pendulum, _), _ = jax.jit(lambda carry: jax.lax.scan(once, carry, None, length=400))(
+        (pendulum, state)
+    )
     assert abs(pendulum.l2 - WANTED.l2) < 1e-6
     assert pendulum.l1 == 0.2
 
@@ -107,7 +125,9 @@ def test_equinox_takes_them_apart_and_together():
 
     pendulum = Pendulum()
     slope = eqx.filter_grad(misfit)(pendulum)
-    np.testing.assert_allclose(jax.tree.leaves(slope), jax.tree.leaves(jax.grad(misfit)(pendulum)), rtol=1e-14)
+    np.testing.assert_allclose(
+        jax.tree.leaves(slope), jax.tree.leaves(jax.grad(misfit)(pendulum)), rtol=1e-14
+    )
     moved = eqx.apply_updates(pendulum, jax.tree.map(lambda x: -0.01 * x, slope))
     assert misfit(moved) < misfit(pendulum)
     mask = eqx.tree_at(lambda p: p.l2, jax.tree.map(lambda _: False, pendulum), True)
@@ -126,12 +146,19 @@ def test_optimistix_finds_a_pendulum():
     modes = dpend.normal_modes(wanted)
 
     def residuals(pendulum, _):
-        periods = [a.period / b.period - 1 for a, b in zip(dpend.normal_modes(pendulum), modes, strict=True)]
-        return periods, [getattr(pendulum, name) - getattr(wanted, name) for name in ("l1", "m1", "g")]
+        periods = [
+            a.period / b.period - 1
+            for a, b in zip(dpend.normal_modes(pendulum), modes, strict=True)
+        ]
+        return periods, [
+            getattr(pendulum, name) - getattr(wanted, name) for name in ("l1", "m1", "g")
+        ]
 
     start = jax.tree.map(jnp.asarray, Pendulum())
     with jax.numpy_dtype_promotion("standard"):
-        found = optx.least_squares(residuals, optx.LevenbergMarquardt(1e-12, 1e-12), start, max_steps=100)
+        found = optx.least_squares(
+            residuals, optx.LevenbergMarquardt(1e-12, 1e-12), start, max_steps=100
+        )
     np.testing.assert_allclose(jax.tree.leaves(found.value), jax.tree.leaves(wanted), rtol=1e-8)
 
 

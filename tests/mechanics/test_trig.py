@@ -35,8 +35,12 @@ def test_error_below_two_ulp(reach):
 def test_error_below_two_ulp_near_multiples_of_half_pi():
     rng = np.random.default_rng(2)
     nearest = rng.integers(-63661, 63661, 800) * (np.pi / 2)
-    nearest = np.append(nearest, -60130 * (np.pi / 2))  # where three pieces of pi/2 leave thirteen units
-    x = np.concatenate([nearest, np.nextafter(nearest, np.inf), nearest + rng.normal(size=nearest.size) * 1e-9])
+    nearest = np.append(
+        nearest, -60130 * (np.pi / 2)
+    )  # where three pieces of pi/2 leave thirteen units
+    x = np.concatenate(
+        [nearest, np.nextafter(nearest, np.inf), nearest + rng.normal(size=nearest.size) * 1e-9]
+    )
     assert errors(x).max() < 2.0
 
 
@@ -49,7 +53,9 @@ def test_absolute_error_up_to_1e7():
 
 
 def test_nan_beyond_what_can_be_reduced():
-    beyond = np.array([np.nextafter(trig.LARGEST_ANGLE, np.inf), -2e7, 1e300, np.inf, -np.inf, np.nan])
+    beyond = np.array(
+        [np.nextafter(trig.LARGEST_ANGLE, np.inf), -2e7, 1e300, np.inf, -np.inf, np.nan]
+    )
     assert np.isnan(np.array(SINCOS(beyond))).all()
     assert errors(np.array([trig.LARGEST_ANGLE, -trig.LARGEST_ANGLE])).max() < 2.0
 
@@ -60,7 +66,12 @@ def test_derivatives_of_all_orders():
         return jnp.stack(trig.sincos(x))
 
     x = 0.7
-    expected = [(np.sin(x), np.cos(x)), (np.cos(x), -np.sin(x)), (-np.sin(x), -np.cos(x)), (-np.cos(x), np.sin(x))]
+    expected = [
+        (np.sin(x), np.cos(x)),
+        (np.cos(x), -np.sin(x)),
+        (-np.sin(x), -np.cos(x)),
+        (-np.cos(x), np.sin(x)),
+    ]
     derivative = both
     for order in range(5):
         np.testing.assert_allclose(derivative(x), expected[order % 4], rtol=4e-16)
@@ -70,4 +81,6 @@ def test_derivatives_of_all_orders():
 
 def test_agrees_inside_any_compilation():
     x = np.linspace(-20.0, 20.0, 1001)
-    np.testing.assert_allclose(SINCOS(x), jax.vmap(trig.sincos)(jnp.asarray(x)), rtol=0, atol=2.3e-16)
+    np.testing.assert_allclose(
+        SINCOS(x), jax.vmap(trig.sincos)(jnp.asarray(x)), rtol=0, atol=2.3e-16
+    )

@@ -36,10 +36,15 @@ def test_order(paper, name, order, steps):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "order", "steps"),
-    [("rk8-circle-rescaled", 8, (14, 16, 18, 20, 24)), ("rk10-circle-rescaled", 10, (10, 11, 12, 13, 14))],
+    [
+        ("rk8-circle-rescaled", 8, (14, 16, 18, 20, 24)),
+        ("rk10-circle-rescaled", 10, (10, 11, 12, 13, 14)),
+    ],
 )
 def test_order_in_rescaled_time(paper, name, order, steps):
-    """Over 64 releases: on one alone, errors of opposite sign meet at some step and feign any order."""
+    """Over 64 releases: on one alone, errors of opposite sign meet at some step and feign any
+    order.
+    """
     theta1, theta2 = np.meshgrid(np.linspace(1.0, 2.6, 8), np.linspace(-2.5, 2.5, 8))
     start = dpend.released(theta1.ravel(), theta2.ravel())
 
@@ -56,7 +61,9 @@ def test_order_in_rescaled_time(paper, name, order, steps):
 
 @pytest.mark.parametrize("tableau", [RK4, RK8, RK10])
 def test_tableaus_satisfy_their_order_conditions(tableau):
-    """Quadrature to the order, and the bushy and tall trees: sum b_i c_i^k = 1/(k + 1), b A^(k-1) 1 = 1/k!."""
+    """Quadrature to the order, and the bushy and tall trees: sum b_i c_i^k = 1/(k + 1), b A^(k-1) 1
+    = 1/k!.
+    """
     stages = len(tableau.b)
     a = np.array([[*row, *[0.0] * (stages - len(row))] for row in tableau.a])
     b, c = np.array(tableau.b), a.sum(axis=1)
@@ -84,7 +91,9 @@ def test_the_circles_tangents_are_those_of_the_canonical_step(pendulum):
 
 
 def test_rk4_is_the_papers_step(paper):
-    """3000 steps of 1 ms against a plain numpy loop of the classical method on the paper's own equations."""
+    """3000 steps of 1 ms against a plain numpy loop of the classical method on the paper's own
+    equations.
+    """
     l1, l2, m1, m2, g = (float(value) for value in jax.tree.leaves(paper))
     mu = m2 / m1
 
@@ -110,7 +119,9 @@ def test_rk4_is_the_papers_step(paper):
         k3 = slope(x + h / 2 * k2)
         k4 = slope(x + h * k3)
         x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    end = dpend.flow(paper, dpend.released(np.radians(40), np.radians(49.1)), 3.0, Scheme("rk4", 1e-3))
+    end = dpend.flow(
+        paper, dpend.released(np.radians(40), np.radians(49.1)), 3.0, Scheme("rk4", 1e-3)
+    )
     np.testing.assert_allclose(jax.tree.leaves(end), x, rtol=0, atol=2e-13)
 
 
@@ -124,7 +135,10 @@ def test_tangents_are_derivatives_and_leave_the_motion_alone(paper, name):
     nudge = 1e-6
     ahead = jax.jit(scheme.advance)(paper, State(1.0 + nudge, -0.7, 0.01, 0.004), 0.01)
     behind = jax.jit(scheme.advance)(paper, State(1.0 - nudge, -0.7, 0.01, 0.004), 0.01)
-    difference = [(a - b) / (2 * nudge) for a, b in zip(jax.tree.leaves(ahead), jax.tree.leaves(behind), strict=True)]
+    difference = [
+        (a - b) / (2 * nudge)
+        for a, b in zip(jax.tree.leaves(ahead), jax.tree.leaves(behind), strict=True)
+    ]
     np.testing.assert_allclose([leaf[0] for leaf in jax.tree.leaves(moved)], difference, atol=2e-10)
 
 
@@ -143,7 +157,9 @@ def test_number_of_steps():
 
 
 def test_the_circle_drifts_like_the_methods_error(paper):
-    """s^2 + c^2 = 1 is no invariant of the circle form: it is off by an error of the method's order."""
+    """s^2 + c^2 = 1 is no invariant of the circle form: it is off by an error of the method's
+    order.
+    """
     drifts = []
     for n in (200, 400):
         scheme = Scheme("rk4-circle", 1.0 / n)
@@ -157,16 +173,28 @@ def test_the_circle_drifts_like_the_methods_error(paper):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param("rk8-circle", marks=pytest.mark.slow), "rk8-circle-rescaled", "rk10-circle-rescaled", "gauss"]
+    "name",
+    [
+        pytest.param("rk8-circle", marks=pytest.mark.slow),
+        "rk8-circle-rescaled",
+        "rk10-circle-rescaled",
+        "gauss",
+    ],
 )
-@pytest.mark.parametrize("pendulum", [dpend.Pendulum(0.3, 0.1, 0.05, 0.4), dpend.Pendulum(1.0, 2.0, 3.0, 0.1, 0.0)])
+@pytest.mark.parametrize(
+    "pendulum", [dpend.Pendulum(0.3, 0.1, 0.05, 0.4), dpend.Pendulum(1.0, 2.0, 3.0, 0.1, 0.0)]
+)
 def test_the_forms_move_other_pendulums_alike(name, pendulum):
-    """Momenta, other masses and lengths, no gravity, backwards too: the same motion as in (theta, p)."""
+    """Momenta, other masses and lengths, no gravity, backwards too: the same motion as in (theta,
+    p).
+    """
     start = dpend.momenta(pendulum, 0.4, -2.0, 3.0, -5.0)
     for duration in (0.5, -0.5):
         plain = dpend.flow(pendulum, start, duration, Scheme("rk8", 5e-4))
         other = dpend.flow(pendulum, start, duration, Scheme(name, 5e-4))
-        np.testing.assert_allclose(jax.tree.leaves(other), jax.tree.leaves(plain), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            jax.tree.leaves(other), jax.tree.leaves(plain), rtol=1e-9, atol=1e-9
+        )
 
 
 @pytest.mark.slow
@@ -193,8 +221,9 @@ def test_scheme_for_a_tolerance(paper):
 
 @pytest.mark.slow
 def test_gauss_is_symplectic_and_its_own_inverse(paper):
-    """Whatever the step: M^T J M = J for the derivative of the step's map, which no explicit method here satisfies, and
-    a step back returns to the last bits."""
+    """Whatever the step: M^T J M = J for the derivative of the step's map, which no explicit method
+    here satisfies, and a step back returns to the last bits.
+    """
     zero, one = np.zeros((2, 2)), np.eye(2)
     form = np.block([[zero, one], [-one, zero]])
 
@@ -205,13 +234,17 @@ def test_gauss_is_symplectic_and_its_own_inverse(paper):
     assert defect("gauss", 0.04) < 1e-12
     assert defect("rk8", 0.04) > 1e-10
     there = dpend.flow(paper, STATE, 0.4, Scheme("gauss", 0.04))
-    back = dpend.flow(paper, there, -0.4, Scheme("gauss", 0.04))  # the momenta are iterated to the end backwards, too
+    back = dpend.flow(
+        paper, there, -0.4, Scheme("gauss", 0.04)
+    )  # the momenta are iterated to the end backwards, too
     np.testing.assert_allclose(jax.tree.leaves(back), jax.tree.leaves(STATE), rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow
 def test_gauss_keeps_the_energy(paper):
-    """Over 2000 periods of 80 steps no more than rounding, and 30 times less than order 8 loses with as much work."""
+    """Over 2000 periods of 80 steps no more than rounding, and 30 times less than order 8 loses
+    with as much work.
+    """
     orbit = dpend.find_orbit(paper, np.radians(40.0), branch="in-phase")
     period, energy = float(orbit.period), float(orbit.energy)
     drifts = []
@@ -227,7 +260,9 @@ def test_gauss_keeps_the_energy(paper):
 
 @pytest.mark.slow
 def test_gauss_derivatives(paper):
-    """Forward and reverse, of one lane and of many, by the implicit function theorem: against order 8."""
+    """Forward and reverse, of one lane and of many, by the implicit function theorem: against order
+    8.
+    """
 
     def end(theta1, pendulum, scheme):
         return dpend.flow(pendulum, dpend.released(theta1, 0.4), 0.4, scheme).theta2
@@ -236,11 +271,15 @@ def test_gauss_derivatives(paper):
     for derivative in (jax.grad, jax.jacfwd):
         ours = derivative(end, (0, 1))(0.6, paper, gauss)
         np.testing.assert_allclose(
-            jax.tree.leaves(ours), jax.tree.leaves(jax.grad(end, (0, 1))(0.6, paper, fine)), rtol=1e-8
+            jax.tree.leaves(ours),
+            jax.tree.leaves(jax.grad(end, (0, 1))(0.6, paper, fine)),
+            rtol=1e-8,
         )
     angles = np.array([0.3, 0.6, 2.9])
     many = jax.vmap(jax.grad(end), (0, None, None))(angles, paper, gauss)
-    np.testing.assert_allclose(many, [jax.grad(end)(angle, paper, fine) for angle in angles], rtol=1e-8)
+    np.testing.assert_allclose(
+        many, [jax.grad(end)(angle, paper, fine) for angle in angles], rtol=1e-8
+    )
 
 
 def test_gauss_says_where_its_step_has_no_solution(paper):

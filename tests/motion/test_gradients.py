@@ -39,7 +39,9 @@ def test_a_wrong_rule_is_told_with_its_size():
     def sine(x):
         return jnp.sin(x)
 
-    sine.defjvp(lambda primals, tangents: (sine(*primals), 1.0001 * jnp.cos(primals[0]) * tangents[0]))
+    sine.defjvp(
+        lambda primals, tangents: (sine(*primals), 1.0001 * jnp.cos(primals[0]) * tangents[0])
+    )
     check = dpend.check_gradient(sine, 0.7)
     assert check.status == Status.DISAGREEMENT
     np.testing.assert_allclose(check.disagreement, 1e-4, rtol=1e-3)
@@ -73,11 +75,15 @@ def end_angle(paper, duration, scheme, state):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("duration", "status"), [(1.0, Status.CONVERGED), (10.0, Status.BEYOND_HORIZON)])
+@pytest.mark.parametrize(
+    ("duration", "status"), [(1.0, Status.CONVERGED), (10.0, Status.BEYOND_HORIZON)]
+)
 def test_a_chaotic_motion_is_believed_up_to_its_horizon(paper, duration, status):
     scheme, state = Scheme("rk4", 2e-3), dpend.released(*CHAOTIC)
     loss = jax.jit(partial(end_angle, paper, duration, scheme))
-    check = dpend.check_gradient(loss, state, motion=(paper, state, duration, scheme), reverse=False)
+    check = dpend.check_gradient(
+        loss, state, motion=(paper, state, duration, scheme), reverse=False
+    )
     assert check.status == status, check.message
     assert (check.disagreement < 1e-6) == (status == Status.CONVERGED)
     assert (check.horizon.horizon < duration) == (status == Status.BEYOND_HORIZON)
@@ -87,7 +93,10 @@ def test_a_chaotic_motion_is_believed_up_to_its_horizon(paper, duration, status)
 def test_the_horizon_of_the_papers_chaotic_motion(paper):
     """A coarse step loses; the growth is the motion's own, whatever the step."""
     state = dpend.released(*CHAOTIC)
-    found = {step: dpend.gradient_horizon(paper, state, 12.8, Scheme("rk8", step)) for step in (5e-3, 2e-3)}
+    found = {
+        step: dpend.gradient_horizon(paper, state, 12.8, Scheme("rk8", step))
+        for step in (5e-3, 2e-3)
+    }
     assert 5 < found[5e-3].horizon < 8 < found[2e-3].horizon < 10
     for one in found.values():
         assert one.status == Status.BEYOND_HORIZON
@@ -99,7 +108,9 @@ def test_the_horizon_of_the_papers_chaotic_motion(paper):
 
 @pytest.mark.slow
 def test_the_error_is_what_another_integrator_differs_by(paper):
-    """Tangents by another method at a fifth of the step: what they differ by is the error that was told."""
+    """Tangents by another method at a fifth of the step: what they differ by is the error that was
+    told.
+    """
     state, scheme = dpend.released(*CHAOTIC), Scheme("rk8", 2e-3)
     found = dpend.gradient_horizon(paper, state, 12.0, scheme)
     basis = State(*jnp.eye(4)[:, :2])  # released a little elsewhere
@@ -111,7 +122,8 @@ def test_the_error_is_what_another_integrator_differs_by(paper):
     for index in (100, 140, 180):
         duration = float(found.time[index])
         one, other = (
-            angles(duration, Scheme(name, step, False)) for name, step in (("rk8", 2e-3), ("rk8-circle", 4e-4))
+            angles(duration, Scheme(name, step, False))
+            for name, step in (("rk8", 2e-3), ("rk8-circle", 4e-4))
         )
         parted = np.linalg.norm(one - other) / np.linalg.norm(other)
         assert 0.02 < parted / float(found.error[index]) < 20
@@ -126,7 +138,9 @@ def test_a_regular_motion_has_no_horizon(paper):
     assert found.status == Status.CONVERGED
     assert found.horizon == 12.0
     assert found.error[-1] < 1e-12
-    coarse = dpend.gradient_horizon(paper, dpend.released(0.3, 0.4), 12.0, Scheme("rk8", 4e-2), tolerance=1e-9)
+    coarse = dpend.gradient_horizon(
+        paper, dpend.released(0.3, 0.4), 12.0, Scheme("rk8", 4e-2), tolerance=1e-9
+    )
     assert coarse.horizon < 12.0
 
 
@@ -147,7 +161,10 @@ def test_implicit_derivatives_of_orbits_and_families(paper):
 @pytest.mark.parametrize(
     ("request_", "text"),
     [
-        ({"loss": lambda x: jnp.stack([x, x])}, "loss must give a real scalar, got float64 of shape"),
+        (
+            {"loss": lambda x: jnp.stack([x, x])},
+            "loss must give a real scalar, got float64 of shape",
+        ),
         ({"parameters": np.nan}, "parameters must be one finite number or more"),
         ({"parameters": {}}, "parameters must be one finite number or more"),
         ({"parameters": "x"}, "parameters must be finite numbers"),

@@ -1,4 +1,6 @@
-"""Orbits against independently computed numbers, other integrators, scaling laws and finite differences."""
+"""Orbits against independently computed numbers, other integrators, scaling laws and finite
+differences.
+"""
 
 import itertools
 from functools import partial
@@ -13,7 +15,8 @@ from scipy.optimize import root
 import dpend
 from dpend import Pendulum, Status
 
-# The eight orbits of the paper's pendulum: request, theta2 [deg], period [s]; of the last two, theta1 = +-theta2.
+# The eight orbits of the paper's pendulum: request, theta2 [deg], period [s]; of the last two,
+# theta1 = +-theta2.
 PAPER = [
     ({"theta1": 40, "branch": "in-phase"}, 49.066544773743, 1.2127563331460),
     ({"theta1": 10, "branch": "in-phase"}, 14.036368411360, 1.1757686075828),
@@ -62,7 +65,9 @@ def test_the_papers_orbits(paper, request_, theta2, period):
     assert np.degrees(angle_error) < 1e-11
     assert period_error < 1e-12
     assert 3 <= orbit.iterations <= 8
-    np.testing.assert_allclose([orbit.dual.theta1, orbit.dual.theta2], [-orbit.theta1, -orbit.theta2], rtol=1e-15)
+    np.testing.assert_allclose(
+        [orbit.dual.theta1, orbit.dual.theta2], [-orbit.theta1, -orbit.theta2], rtol=1e-15
+    )
 
 
 @pytest.mark.parametrize(("branch", "theta1", "theta2", "period", "kappa"), UNIT)
@@ -75,7 +80,9 @@ def test_reference_values_in_natural_units(unit, branch, theta1, theta2, period,
 
 @pytest.mark.parametrize(("request_", "theta2", "period"), PAPER)
 def test_diffrax_solves_for_the_same_roots(paper, request_, theta2, period):
-    """The same two equations with Dopri8 as the flow and scipy's hybrid method instead of Newton's."""
+    """The same two equations with Dopri8 as the flow and scipy's hybrid method instead of
+    Newton's.
+    """
     theta1, ratio = np.radians(request_["theta1"]), request_.get("ratio")
 
     def equations(unknown):
@@ -93,16 +100,26 @@ def test_diffrax_solves_for_the_same_roots(paper, request_, theta2, period):
 
 @pytest.mark.parametrize(
     ("theta2", "period", "symmetry"),
-    [FORTY[0], FORTY[2], *(pytest.param(*orbit, marks=pytest.mark.slow) for orbit in (FORTY[1], *FORTY[3:]))],
+    [
+        FORTY[0],
+        FORTY[2],
+        *(pytest.param(*orbit, marks=pytest.mark.slow) for orbit in (FORTY[1], *FORTY[3:])),
+    ],
 )
 def test_orbits_from_guesses_at_forty_degrees(paper, theta2, period, symmetry):
-    """From guesses a tenth of a degree and milliseconds off, centred orbits told apart from other brake orbits."""
+    """From guesses a tenth of a degree and milliseconds off, centred orbits told apart from other
+    brake orbits.
+    """
     orbit = find(paper, 40, guess=(np.radians(theta2 + 0.1), period * 1.003))
     assert abs(np.degrees(orbit.theta2) - theta2) < 2e-9
     assert abs(orbit.period - period) < 1e-9
     assert orbit.symmetry == (symmetry or "brake")
     back = dpend.find_orbit(
-        paper, orbit.dual.theta1, guess=(orbit.dual.theta2, orbit.period), symmetry=orbit.symmetry, error=False
+        paper,
+        orbit.dual.theta1,
+        guess=(orbit.dual.theta2, orbit.period),
+        symmetry=orbit.symmetry,
+        error=False,
     )
     np.testing.assert_allclose([back.period, back.kappa], [orbit.period, orbit.kappa], rtol=1e-7)
     np.testing.assert_allclose(back.dual.theta2, orbit.theta2, atol=1e-9)
@@ -129,7 +146,9 @@ def test_newton_squares_its_residual(paper):
             )
             for k in (1, 2, 3, 4)
         ]  # fmt: skip
-        rates = [after / before**2 for before, after in itertools.pairwise(residuals) if after > 1e-14]
+        rates = [
+            after / before**2 for before, after in itertools.pairwise(residuals) if after > 1e-14
+        ]
         assert len(rates) == 3 or residuals[-1] < 1e-14
         assert max(rates) < 10 * min(rates)
         final = find(paper, 40, guess=(np.radians(theta2), period), symmetry=symmetry)
@@ -149,7 +168,9 @@ def test_small_swings_are_the_normal_modes(paper):
     for branch, mode in zip(("in-phase", "anti-phase"), dpend.normal_modes(paper), strict=True):
         orbit = dpend.find_orbit(paper, 1e-7, branch=branch)
         assert orbit.status == Status.CONVERGED
-        np.testing.assert_allclose([orbit.theta2 / 1e-7, orbit.period], [mode.ratio, mode.period], rtol=1e-12)
+        np.testing.assert_allclose(
+            [orbit.theta2 / 1e-7, orbit.period], [mode.ratio, mode.period], rtol=1e-12
+        )
 
 
 @pytest.mark.parametrize(
@@ -172,7 +193,9 @@ def test_a_branch_that_turns_is_followed_through_its_turns(pendulum, angles):
     # Just inside the turn there are three passages, just outside one.
     for inside, outside in ((angles[0] - 0.3, angles[0] + 0.3), (angles[1] + 0.1, angles[1] - 0.1)):
         assert find(pendulum, inside, branch="in-phase", crossing=3).theta2 > thetas[1]
-        beyond = dpend.find_orbit(pendulum, np.radians(outside), branch="in-phase", crossing=2, error=False)
+        beyond = dpend.find_orbit(
+            pendulum, np.radians(outside), branch="in-phase", crossing=2, error=False
+        )
         assert beyond.status in (Status.NO_SUCH_ORBIT, Status.LEFT_BRANCH)
 
 
@@ -200,7 +223,9 @@ def test_failures_are_statuses(paper):
 @pytest.mark.slow
 def test_everything_traces(paper):
     angles = jnp.radians(jnp.array([20.0, -90.0, 150.0]))
-    many = jax.jit(jax.vmap(partial(dpend.find_orbit, paper, branch="anti-phase", error=False)))(angles)
+    many = jax.jit(jax.vmap(partial(dpend.find_orbit, paper, branch="anti-phase", error=False)))(
+        angles
+    )
     for i, angle in enumerate(angles):
         single = dpend.find_orbit(paper, angle, branch="anti-phase", error=False)
         np.testing.assert_allclose(many.theta2[i], single.theta2, rtol=1e-11)
@@ -230,17 +255,25 @@ def test_derivatives_are_those_of_the_root(paper, request_):
     def difference(along):
         return (along(nudge) - along(-nudge)) / (2 * nudge)
 
-    np.testing.assert_allclose(by_angle, difference(lambda h: properties(theta1 + h, paper)), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        by_angle, difference(lambda h: properties(theta1 + h, paper)), rtol=1e-6, atol=1e-7
+    )
     for name in ("l2", "m1"):
         exact = getattr(by_pendulum, name)
         base = getattr(paper, name)
-        numeric = difference(lambda h, n=name, b=base: properties(theta1, Pendulum(**{n: b * (1 + h)}))) / base
+        numeric = (
+            difference(lambda h, n=name, b=base: properties(theta1, Pendulum(**{n: b * (1 + h)})))
+            / base
+        )
         np.testing.assert_allclose(exact, numeric, rtol=2e-6, atol=1e-6)
-    # Scaling: lengths together stretch time like sqrt(l), masses together and gravity do nothing to angles and kappa.
+    # Scaling: lengths together stretch time like sqrt(l), masses together and gravity do nothing to
+    # angles and kappa.
     _, period, _, kappa = properties(theta1, paper)
     by_length = by_pendulum.l1 * paper.l1 + by_pendulum.l2 * paper.l2
     np.testing.assert_allclose(by_length[jnp.array([0, 1, 3])], [0, period / 2, 0], atol=1e-9)
-    np.testing.assert_allclose(by_pendulum.g[jnp.array([0, 1, 3])] * paper.g, [0, -period / 2, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        by_pendulum.g[jnp.array([0, 1, 3])] * paper.g, [0, -period / 2, 0], atol=1e-9
+    )
     by_mass = by_pendulum.m1 * paper.m1 + by_pendulum.m2 * paper.m2
     np.testing.assert_allclose(by_mass[jnp.array([0, 1, 3])], 0, atol=1e-9)
     assert abs(kappa) > 0.1
@@ -261,7 +294,9 @@ def test_orbits_come_back(paper):
     for branch, angle in (("in-phase", 120), ("anti-phase", 30)):
         orbit = find(paper, angle, branch=branch)
         back = dpend.reference(paper, orbit.state, [float(orbit.period)])
-        missed = max(abs(back.state.theta1[0] - orbit.theta1), abs(back.state.theta2[0] - orbit.theta2))
+        missed = max(
+            abs(back.state.theta1[0] - orbit.theta1), abs(back.state.theta2[0] - orbit.theta2)
+        )
         assert missed < 1e-10 * max(1.0, abs(orbit.kappa))
 
 
@@ -297,7 +332,9 @@ FIVE = [(1.0, 1.0), (0.5, 1.0), (2.0, 0.3), (1.0, 0.1), (1.0, 10.0)]
 @pytest.mark.parametrize("branch", ["in-phase", "anti-phase"])
 @pytest.mark.parametrize("ratios", FIVE)
 def test_every_degree_of_five_pendulums(ratios, branch):
-    """1 to 175 deg: the same orbit at half the integration step, and an error estimate that says so."""
+    """1 to 175 deg: the same orbit at half the integration step, and an error estimate that says
+    so.
+    """
     pendulum = Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0)
     worst = 0.0
     for degree in range(1, 176):
@@ -316,7 +353,9 @@ def test_every_degree_of_five_pendulums(ratios, branch):
 def test_extreme_mass_ratios(mass):
     """They run, or say why not: small swings always, and no orbit that is not one."""
     pendulum = Pendulum(1.0, 1.0, 1.0, mass, 1.0)
-    for branch, degree in itertools.product(("in-phase", "anti-phase"), (1e-4, 0.01, 1.0, 10.0, 45.0)):
+    for branch, degree in itertools.product(
+        ("in-phase", "anti-phase"), (1e-4, 0.01, 1.0, 10.0, 45.0)
+    ):
         orbit = dpend.find_orbit(pendulum, np.radians(degree), branch=branch)
         assert orbit.status in (Status.CONVERGED, Status.LEFT_BRANCH), (branch, degree)
         if orbit.status == Status.CONVERGED:
@@ -327,7 +366,9 @@ def test_extreme_mass_ratios(mass):
             assert missed < 1e-9 + 10 * back.error_estimate + 1e-10 * abs(orbit.kappa) ** 0.5
 
 
-@pytest.mark.parametrize(("which", "k"), [(0, 17), (0, 18), (0, 50), (3, 18), (2, 18), (4, 17), (4, 18)])
+@pytest.mark.parametrize(
+    ("which", "k"), [(0, 17), (0, 18), (0, 50), (3, 18), (2, 18), (4, 17), (4, 18)]
+)
 def test_no_multiple_of_the_period_is_too_large(paper, which, k):
     """Centred and brake orbits, stable and not, guessed with many times their period."""
     theta2, period, symmetry = FORTY[which]
@@ -339,14 +380,18 @@ def test_no_multiple_of_the_period_is_too_large(paper, which, k):
 
 
 def test_a_guess_too_long_to_be_integrated_says_so(paper):
-    orbit = dpend.find_orbit(paper, np.radians(40), guess=(np.radians(-51.139513966), 1e6 * 0.754418866), error=False)
+    orbit = dpend.find_orbit(
+        paper, np.radians(40), guess=(np.radians(-51.139513966), 1e6 * 0.754418866), error=False
+    )
     assert orbit.status == Status.BEYOND_HORIZON
     assert np.isnan(orbit.kappa)
 
 
 @pytest.mark.slow
 def test_no_error_is_above_ten_times_its_estimate():
-    """Random pendulums and releases against Newton's method in long double, by another integrator."""
+    """Random pendulums and releases against Newton's method in long double, by another
+    integrator.
+    """
     pytest.importorskip("heyoka")
     if not extended.is_extended():
         pytest.skip("long double is double here")

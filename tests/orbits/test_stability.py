@@ -23,7 +23,12 @@ def matrix_over(orbit, share):
 def orbits(paper):
     return [
         dpend.find_orbit(paper, np.radians(angle), branch=branch)
-        for angle, branch in ((40, "in-phase"), (40, "anti-phase"), (90, "anti-phase"), (140, "in-phase"))
+        for angle, branch in (
+            (40, "in-phase"),
+            (40, "anti-phase"),
+            (90, "anti-phase"),
+            (140, "in-phase"),
+        )
     ]
 
 
@@ -38,7 +43,9 @@ def test_transition_matrices_are_symplectic(orbits):
 def test_quarter_half_and_whole_period_agree(orbits):
     for orbit in orbits:
         quarter, half, whole = (matrix_over(orbit, share) for share in (0.25, 0.5, 1.0))
-        np.testing.assert_allclose(stability.half_from_quarter(quarter), half, atol=1e-10 * np.abs(half).max())
+        np.testing.assert_allclose(
+            stability.half_from_quarter(quarter), half, atol=1e-10 * np.abs(half).max()
+        )
         routes = [
             stability.kappa_of_centred(quarter),
             stability.kappa_of_brake(half),
@@ -61,7 +68,9 @@ def test_monodromy_has_the_flow_as_an_eigenvector_and_powers_for_covers(orbits):
         np.testing.assert_allclose(twice, once @ once, atol=1e-10 * np.abs(twice).max())
         field = np.array(jax.tree.leaves(dpend.vector_field(orbit.pendulum, orbit.state)))
         np.testing.assert_allclose(once @ field, field, atol=1e-10 * np.abs(once).max())
-        apart = np.abs(np.array(dpend.multipliers(orbit.kappa))[:, None] - np.linalg.eigvals(once)[None, :])
+        apart = np.abs(
+            np.array(dpend.multipliers(orbit.kappa))[:, None] - np.linalg.eigvals(once)[None, :]
+        )
         # The trivial pair is a Jordan block: it splits like the square root of the error.
         assert apart.min(axis=1).max() < 1e-4
         assert apart.min(axis=0).max() < 1e-4
