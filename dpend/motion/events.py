@@ -356,7 +356,7 @@ class _Watch(NamedTuple):
         def once(work: tuple[Scalar, _Probe, Crossing]) -> tuple[Scalar, _Probe, Crossing]:
             index, probe, crossing = work
             state = self.scheme.leave(
-                unit, self.scheme.move(self.scheme.lasting(unit, probe.share * dt), point)
+                unit, self.scheme.move(self.scheme.with_step(unit, probe.share * dt), point)
             )
             # XLA would compute the step again for each of its uses.
             state = lax.optimization_barrier(state)
