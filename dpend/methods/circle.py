@@ -156,8 +156,9 @@ class _CircleForm(Form):
         sin2, cos2 = sincos(state.theta2)
         root = _root_mu(pendulum)
         unit1, unit2 = _rate_units(pendulum)
+        on_circles = root * sin1, root * cos1, sin2, cos2
         rates = state.p1 / unit1, state.p2 / unit2
-        return _Circle(state.theta1, state.theta2, root * sin1, root * cos1, sin2, cos2, *rates)
+        return _Circle(state.theta1, state.theta2, *on_circles, *rates)
 
     def leave(self, constants: _Constants, point: _Circle) -> State:
         momenta = constants.unit1 * point.rate1, constants.unit2 * point.rate2
