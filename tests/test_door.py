@@ -747,7 +747,7 @@ DOORS = {
             "duration": kind([*NUMBER[0], 0], HALVES),
             "tolerance": POSITIVE,
         },
-        "dpend.motion.gradients._compared",
+        "dpend.motion.gradients._compare_tangents",
     ),
     "sweep": Door(
         dpend.sweep,
