@@ -446,7 +446,6 @@ DOORS = {
             "save_every": COUNT,
             "most_steps": BUDGET,
             "error": FLAG,
-            "drift_tolerance": MAYBE_POSITIVE,
             "tolerance": kind(POSITIVE[0][1:]),
         },
         "dpend.motion.simulate._simulate",
@@ -455,7 +454,7 @@ DOORS = {
         dpend.simulate,
         {"pendulum": PAPER, "state": RELEASE, "duration": 1.0},
         {"tolerance": MAYBE_POSITIVE},
-        "dpend.motion.simulate._scheme_reaching",
+        "dpend.motion.simulate.find_scheme",
     ),
     "reference": Door(
         dpend.reference,
@@ -748,7 +747,7 @@ DOORS = {
             "duration": kind([*NUMBER[0], 0], HALVES),
             "tolerance": POSITIVE,
         },
-        "dpend.motion.gradients._compared",
+        "dpend.motion.gradients._compare_tangents",
     ),
     "sweep": Door(
         dpend.sweep,
@@ -1036,7 +1035,6 @@ TRACEABLE = {
     *(("momenta", rate) for rate in ("omega1", "omega2")),
     *((name, "duration") for name in ("flow", "fold")),
     ("fold", "init"),
-    ("simulate", "drift_tolerance"),
     ("reference", "tolerance"),
     ("multipliers", "kappa"),
     *(("find_orbit", name) for name in ("theta1", "turn", "tolerance", "max_iterations")),

@@ -17,9 +17,10 @@ ORDER = """
 _version _runtime checks status records
 mechanics.trig mechanics.pendulum mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.scheme
-motion.integrate motion.estimate motion.simulate motion.reference motion.events motion.gradients
+motion.integrate motion.estimate motion.simulate motion.reference motion.root motion.events
+motion.gradients
 chaos
-maps.lanes maps.grid maps.cost maps.tiles maps.store maps.layout maps.sweep
+maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
 orbits.stability orbits.arc orbits.newton orbits.single orbits.walk orbits.curve orbits.follow
 orbits.orbit orbits.samples orbits.crossings orbits.special orbits.find orbits.family
 catalogue.bicubic catalogue.scan catalogue.files catalogue.atlas catalogue.track catalogue.survey

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from dpend.checks import Scalar
-from dpend.maps.grid import Task, placed
+from dpend.maps.grid import Task, place
 from dpend.maps.lanes import WIDTH
 from dpend.mechanics.pendulum import Pendulum
 from dpend.methods.scheme import Scheme
@@ -90,7 +90,7 @@ def _cut(
     scheme: Scheme, pendulum: Pendulum, at: dict[str, Scalar], cells: dict[str, Scalar]
 ) -> Scalar:
     def one(cell: dict[str, Scalar]) -> Scalar:
-        here, state = placed(pendulum, at, cell)
+        here, state = place(pendulum, at, cell)
         spin = scheme.spin(scheme.constants(here), scheme.enter(here, state))
         return jax.numpy.maximum(spin, 1.0) ** 0.75
 

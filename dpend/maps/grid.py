@@ -26,20 +26,16 @@ Quantity = Callable[[Pendulum, State, Scheme], Mapping[str, Scalar]]
 # second or so of work.
 _TILE = 256
 _UNITS = {
-    "l1": "m",
-    "l2": "m",
-    "m1": "kg",
-    "m2": "kg",
+    **dict.fromkeys(("l1", "l2"), "m"),
+    **dict.fromkeys(("m1", "m2"), "kg"),
     "g": "m s-2",
-    "theta1": "rad",
-    "theta2": "rad",
-    "p1": "kg m2 s-1",
-    "p2": "kg m2 s-1",
-    "lyapunov": "s-1",
-    "exponent": "s-1",
-    "uncertainty": "s-1",
+    **dict.fromkeys(("theta1", "theta2"), "rad"),
+    **dict.fromkeys(("p1", "p2"), "kg m2 s-1"),
+    **dict.fromkeys(("lyapunov", "exponent", "uncertainty"), "s-1"),
     "flip_time": "s",
 }
+# The name of the steps of both passes, for the rate: no part of the result.
+TAKEN = "steps taken"
 STATE = tuple(field.name for field in fields(State))
 PENDULUM = tuple(field.name for field in fields(Pendulum))
 
@@ -87,13 +83,8 @@ class Keyed:
         own = getattr(inner, "__qualname__", type(inner).__qualname__)
         try:
             source = inspect.getsource(inner)
-        except (
-            OSError,
-            TypeError,
-            SyntaxError,
-            tokenize.TokenError,
-        ):  # another file stands where it was written
-            source = ""
+        except (OSError, TypeError, SyntaxError, tokenize.TokenError):
+            source = ""  # another file stands where it was written
         if strict and name is None:
             if "<" in own or getattr(inner, "__closure__", None):
                 raise ValueError(
@@ -132,56 +123,20 @@ class Grid:
     at: dict[str, float]
 
     @staticmethod
-    def checked(
+    def of(
         pendulum: Pendulum | Any, axes: Mapping[str, Any] | Any, at: Mapping[str, float] | Any
     ) -> "Grid":
-        if isinstance(pendulum, Pendulum) and any(
-            np.ndim(leaf) for leaf in vars(pendulum).values()
-        ):
+        """The grid that a person asks for; raises ValueError where it is none."""
+        if isinstance(pendulum, Pendulum) and any(map(np.ndim, vars(pendulum).values())):
             raise ValueError(
                 "pendulum must have numbers for fields, got arrays: name those that vary as axes"
             )
         pendulum = known_pendulum(pendulum)
-        for name, given in (("axes", axes), ("at", at)):
-            if not isinstance(given, Mapping):
-                raise ValueError(
-                    f"{name} must be a dictionary by field, got {shown(given)}: give one like "
-                    f"{{'p1': 0.1}}"
-                )
-        if not 1 <= len(axes) <= 2:
-            raise ValueError(
-                f"axes must be one or two, got {len(axes)}: give one like {{'theta1': angles}}"
-            )
-        for key in [*axes, *at]:
-            if key not in STATE + PENDULUM:
-                known = ", ".join(STATE + PENDULUM)
-                raise ValueError(
-                    f"axes and at must be fields of State or Pendulum, got {key!r}: give one of "
-                    f"{known}"
-                )
-        twice = [key for key in at if key in axes or key in PENDULUM]
-        if twice:
-            raise ValueError(
-                f"at must name fields of State that are no axis, got {twice[0]!r}: leave it out"
-            )
-        values = {}
-        for key, given in axes.items():
-            array = numbers(f"axis {key}", given)
-            if array.ndim != 1 or not array.size or not np.all(np.isfinite(array)):
-                raise ValueError(
-                    f"axis {key} must be a one-dimensional array of finite numbers, got "
-                    f"{shown(given)}: "
-                    "give other values"
-                )
-            if key in ("l1", "l2", "m1", "m2") and np.any(array <= 0):
-                raise ValueError(
-                    f"axis {key} must be positive, got {array.min():g}: leave that out"
-                )
-            values[key] = array
+        _check_names(axes, at)
+        values = {key: _axis(key, given) for key, given in axes.items()}
         rest = {field: 0.0 for field in STATE if field not in values}
-        return Grid(
-            pendulum, values, rest | {key: known_number(key, value) for key, value in at.items()}
-        )
+        rest |= {key: known_number(key, value) for key, value in at.items()}
+        return Grid(pendulum, values, rest)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -193,29 +148,24 @@ class Grid:
         end of the axes.
         """
         moving = [array for key, array in self.axes.items() if key in STATE]
-        still = all(value == 0.0 for value in self.at.values())
-        return (
-            bool(moving) and still and all(np.array_equal(array, -array[::-1]) for array in moving)
-        )
+        mirrored = all(np.array_equal(array, -array[::-1]) for array in moving)
+        return bool(moving) and mirrored and not any(self.at.values())
 
     def reflected(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
         """The block of mirror images of a block of cells."""
         return tuple(
             slice(size - part.stop, size - part.start) if key in STATE else part
-            for (key, size), part in zip(
-                zip(self.axes, self.shape, strict=True), block, strict=True
-            )
+            for key, size, part in zip(self.axes, self.shape, block, strict=True)
         )
 
-    def turned(self, values: np.ndarray) -> np.ndarray:
+    def flip(self, values: np.ndarray) -> np.ndarray:
         """A block of values in the order of their mirror images."""
         return np.flip(values, tuple(axis for axis, key in enumerate(self.axes) if key in STATE))
 
     def tiles(self) -> Iterator[tuple[slice, ...]]:
         tile = self.tile()
-        for corner in np.ndindex(
-            *(-(-size // side) for size, side in zip(self.shape, tile, strict=True))
-        ):
+        counts = [-(-size // side) for size, side in zip(self.shape, tile, strict=True)]
+        for corner in np.ndindex(*counts):
             yield tuple(
                 slice(index * side, min((index + 1) * side, size))
                 for index, side, size in zip(corner, tile, self.shape, strict=True)
@@ -226,20 +176,53 @@ class Grid:
         images of others.
         """
         side = _TILE if len(self.axes) == 2 else _TILE**2
-        return tuple(
-            min(side, max(1, -(-size // 2)) if self.symmetric else size) for size in self.shape
-        )
+        return tuple(min(side, -(-size // 2) if self.symmetric else size) for size in self.shape)
 
     def lanes(self, block: tuple[slice, ...]) -> dict[str, np.ndarray]:
         """The axes' values of every cell of a block, flat."""
         parts = [array[part] for array, part in zip(self.axes.values(), block, strict=True)]
-        return {
-            key: mesh.ravel()
-            for key, mesh in zip(self.axes, np.meshgrid(*parts, indexing="ij"), strict=True)
-        }
+        meshes = np.meshgrid(*parts, indexing="ij")
+        return {key: mesh.ravel() for key, mesh in zip(self.axes, meshes, strict=True)}
 
 
-def placed(
+def _check_names(axes: Mapping[str, Any] | Any, at: Mapping[str, Any] | Any) -> None:
+    for name, given in (("axes", axes), ("at", at)):
+        if not isinstance(given, Mapping):
+            raise ValueError(
+                f"{name} must be a dictionary by field, got {shown(given)}: give one like "
+                f"{{'p1': 0.1}}"
+            )
+    if not 1 <= len(axes) <= 2:
+        raise ValueError(
+            f"axes must be one or two, got {len(axes)}: give one like {{'theta1': angles}}"
+        )
+    for key in [*axes, *at]:
+        if key not in STATE + PENDULUM:
+            known = ", ".join(STATE + PENDULUM)
+            raise ValueError(
+                f"axes and at must be fields of State or Pendulum, got {key!r}: give one of {known}"
+            )
+    twice = [key for key in at if key in axes or key in PENDULUM]
+    if twice:
+        raise ValueError(
+            f"at must name fields of State that are no axis, got {twice[0]!r}: leave it out"
+        )
+
+
+def _axis(key: str, given: Any) -> np.ndarray:
+    """An axis's values."""
+    array = numbers(f"axis {key}", given)
+    if array.ndim != 1 or not array.size or not np.all(np.isfinite(array)):
+        raise ValueError(
+            f"axis {key} must be a one-dimensional array of finite numbers, got {shown(given)}: "
+            "give other values"
+        )
+    if key in ("l1", "l2", "m1", "m2") and np.any(array <= 0):
+        raise ValueError(f"axis {key} must be positive, got {array.min():g}: leave that out")
+    return array
+
+
+def place(
     pendulum: Pendulum, at: Mapping[str, Scalar], cell: Mapping[str, Scalar]
 ) -> tuple[Pendulum, State]:
     pendulum = replace(pendulum, **{key: value for key, value in cell.items() if key in PENDULUM})
@@ -257,33 +240,22 @@ class _Cell:
     def __call__(
         self, shared: tuple[Pendulum, dict[str, Scalar]], cell: dict[str, Scalar]
     ) -> dict[str, Scalar]:
-        pendulum, state = placed(*shared, cell)
+        pendulum, state = place(*shared, cell)
         values = dict(self.quantity(pendulum, state, self.scheme))
         taken = values.get("steps", 0)
         if self.twice:
             finer = self.quantity(pendulum, state, replace(self.scheme, step=self.scheme.step / 2))
             taken = taken + finer.get("steps", 0)
-            for key in [
-                key
-                for key, value in values.items()
-                if jax.numpy.issubdtype(value.dtype, np.floating)
-            ]:
-                difference = jax.numpy.abs(values[key] - finer[key])
-                values[f"{key}_error"] = jax.numpy.where(values[key] == finer[key], 0.0, difference)
+            for key, value in list(values.items()):
+                if jax.numpy.issubdtype(value.dtype, np.floating):
+                    difference = jax.numpy.abs(value - finer[key])
+                    values[f"{key}_error"] = jax.numpy.where(value == finer[key], 0.0, difference)
         return values | {TAKEN: jax.numpy.asarray(taken)}
-
-
-# The steps of both passes, for the rate; no part of the result.
-TAKEN = "steps taken"
 
 
 @jax.jit
 def release_energy(pendulum: Pendulum, at: dict[str, Scalar], cell: dict[str, Scalar]) -> Scalar:
-    shape = next(iter(cell.values())).shape
-    pendulum, state = placed(
-        pendulum, {key: jax.numpy.full(shape, value) for key, value in at.items()}, cell
-    )
-    return hamiltonian(pendulum, state) * jax.numpy.ones(shape)
+    return jax.vmap(lambda one: hamiltonian(*place(pendulum, at, one)))(cell)
 
 
 @dataclass(frozen=True)
@@ -344,7 +316,8 @@ def kinds_of(task: Task) -> dict[str, np.dtype]:
             )
     del kinds[TAKEN]
     kinds.pop("status", None)
-    taken = [key for key in kinds if key in STATE + PENDULUM or key in coordinates_of(task.grid)]
+    names = {*STATE, *PENDULUM, *coordinates_of(task.grid)}
+    taken = [key for key in kinds if key in names]
     if taken:
         raise ValueError(
             f"a quantity's value must not bear the name of a coordinate, got {taken[0]!r}: call it "

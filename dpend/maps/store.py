@@ -14,7 +14,6 @@ import json
 import os
 import secrets
 import shutil
-import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +22,8 @@ from typing import Any
 import numpy as np
 
 from dpend.checks import unwritable
+from dpend.maps.disk import MISSING, canonical, clear, make_way, put, read, read_json, remove, sync
 
-# Files of metadata have a few kilobytes; a quantity's settings may add to that. Larger ones are not
-# read [bytes].
-_LARGEST_DOCUMENT = 1 << 24
 # Where the digests of tiles and the lock lie: inside an array, where Zarr's readers do not look.
 _DIGESTS, _LOCK = "status/sha256", "status/lock"
 # How many damaged files a warning names.
@@ -68,9 +65,9 @@ class Store:
         try:
             draft.mkdir()
             for name, text in {**self.documents, **self.coordinates, _LOCK: b""}.items():
-                _put(draft, name, text)
+                put(draft, name, text)
             os.rename(draft, self.path)
-            _sync(self.path.parent)
+            sync(self.path.parent)
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise self._unwritable(error) from None
@@ -95,21 +92,18 @@ class Store:
             )
         wanted = self._wanted
         for key in {**wanted, **found}:
-            if _canonical(found.get(key)) != _canonical(wanted.get(key)):
+            if canonical(found.get(key)) != canonical(wanted.get(key)):
                 raise ValueError(
                     f"store {self.path} holds another sweep, its {key} is {found.get(key)!r}, not "
                     f"{wanted.get(key)!r}: give another name"
                 )
+        members = {name.partition("/")[0] for name in self.documents}
         for name in sorted(os.listdir(self.path)):
-            if name not in self._members and not name.endswith(".partial"):
+            if name not in members and not name.endswith(".partial"):
                 raise ValueError(
                     f"store {self.path} holds {name}, which is no part of this sweep: move it "
                     f"elsewhere"
                 )
-
-    @property
-    def _members(self) -> set[str]:
-        return {name.partition("/")[0] for name in self.documents}
 
     def inspect(self) -> "Findings":
         """Every file beside what it should be, one tile at a time."""
@@ -118,30 +112,31 @@ class Store:
             if problem := self._document_problem(name, text):
                 stale[name] = problem
         for name, text in self.coordinates.items():
-            if problem := self._coordinate_problem(name, text, stale):
+            if problem := self._coordinate_problem(name, text):
                 stale[name] = problem
         tiles = {tile: self._tile_problems(tile) for tile in self.tiles}
         todo = [tile for tile in self.tiles if tiles[tile]]
         # Tiles are computed in order: one that was never done has no digest, and none after it has.
         done = sum(1 for _ in itertools.dropwhile(tiles.get, reversed(self.tiles)))
         before = set(self.tiles[:done])
-        again = [tile for tile in todo if tile in before or not self._never_done(tile, tiles[tile])]
+        again = [
+            tile
+            for tile in todo
+            if tile in before or tiles[tile].get(self._digest_name(tile)) != MISSING
+        ]
         damage = stale | {name: why for tile in again for name, why in tiles[tile].items()}
         return Findings(stale, todo, again, damage, list(self.path.glob("*.partial")))
 
-    def _never_done(self, tile: tuple[int, ...], problems: Mapping[str, str]) -> bool:
-        return problems.get(self._digest_name(tile)) == _MISSING
-
     def _document_problem(self, name: str, text: bytes) -> str:
         try:
-            found = _json(self.path / name)
+            found = read_json(self.path / name)
         except ValueError as error:
             return str(error)
-        return "" if _canonical(found) == _canonical(json.loads(text)) else "is another"
+        return "" if canonical(found) == canonical(json.loads(text)) else "is another"
 
-    def _coordinate_problem(self, name: str, text: bytes, stale: Mapping[str, str]) -> str:
+    def _coordinate_problem(self, name: str, text: bytes) -> str:
         try:
-            found = _read(self.path / name, 2 * len(text) + 1024)
+            found = read(self.path / name, 2 * len(text) + 1024)
         except ValueError as error:
             return str(error)
         return "" if found == text else "has other bytes"
@@ -150,14 +145,14 @@ class Store:
         """What is wrong with a tile's files, by name; nothing with one that is done."""
         digest = self._digest_name(tile)
         try:
-            lines = _read(self.path / digest, 1024 * len(self.arrays)).split(b"\n")
+            lines = read(self.path / digest, 1024 * len(self.arrays)).split(b"\n")
         except ValueError as error:
             return {digest: str(error)}
         problems = {}
         for key in self.arrays:
             name = self.chunk(key, tile)
             try:
-                text = _read(self.path / name, self.arrays[key] + self.arrays[key] // 64 + 1024)
+                text = read(self.path / name, self.arrays[key] + self.arrays[key] // 64 + 1024)
                 if self._line(name, text) not in lines:
                     problems[name] = "has other bytes than were written"
             except ValueError as error:
@@ -176,7 +171,7 @@ class Store:
 
     @functools.cached_property
     def _identity(self) -> str:
-        return hashlib.sha256(_canonical(self._wanted).encode()).hexdigest()
+        return hashlib.sha256(canonical(self._wanted).encode()).hexdigest()
 
     @functools.cached_property
     def _wanted(self) -> dict[str, Any]:
@@ -196,15 +191,13 @@ class Store:
         """
         try:
             for leftover in [*findings.leftovers, *self.path.rglob("*.partial")]:
-                _remove(leftover)  # of a process that was killed while it wrote
+                remove(leftover)  # of a process that was killed while it wrote
             for name in findings.stale:
-                _put(self.path, name, {**self.documents, **self.coordinates}[name])
+                put(self.path, name, {**self.documents, **self.coordinates}[name])
             for tile in findings.todo:
-                for name in (
-                    self._digest_name(tile),
-                    *(self.chunk(key, tile) for key in reversed(list(self.arrays))),
-                ):
-                    _clear(self.path, name)
+                clear(self.path, self._digest_name(tile))
+                for key in reversed(list(self.arrays)):
+                    clear(self.path, self.chunk(key, tile))
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -216,7 +209,7 @@ class Store:
         """
         try:
             lines = [self._write_chunk(key, tile, block, values[key]) for key in self.arrays]
-            _put(self.path, self._digest_name(tile), b"".join(line + b"\n" for line in lines))
+            put(self.path, self._digest_name(tile), b"".join(line + b"\n" for line in lines))
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -226,7 +219,7 @@ class Store:
         """Writes an array's chunk; its line in the digest."""
         name = self.chunk(key, tile)
         text = self.encode(name, block, values)
-        _put(self.path, name, text)
+        put(self.path, name, text)
         return self._line(name, text)
 
     def array(self, key: str) -> Any:
@@ -258,9 +251,9 @@ class Store:
             )
         try:
             file = self.path / _LOCK
-            _make_way(self.path, _LOCK)
+            make_way(self.path, _LOCK)
             if not os.path.isfile(file) or file.is_symlink():
-                _remove(file)
+                remove(file)
             file.parent.mkdir(exist_ok=True)
             handle = os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
         except OSError as error:
@@ -342,7 +335,7 @@ def check_store(name: str, path: Path) -> None:
 def _attributes(name: str, path: Path) -> dict[str, Any]:
     """A store's attributes; raises as `check_store` does."""
     try:
-        document = _json(path / "zarr.json")
+        document = read_json(path / "zarr.json")
         problem = "is no description of a sweep"
     except ValueError as error:
         document, problem = None, str(error)
@@ -354,90 +347,3 @@ def _attributes(name: str, path: Path) -> dict[str, Any]:
             "give another name"
         )
     return found
-
-
-_MISSING = "is missing"
-
-
-def _read(path: Path, most: int) -> bytes:
-    """A file's bytes.
-
-    Raises:
-        ValueError: why it is not read, in words that follow its name.
-    """
-    try:
-        found = os.stat(path)
-        if not stat.S_ISREG(found.st_mode):
-            raise ValueError("is no file")
-        if found.st_size > most:
-            raise ValueError(f"has {found.st_size} bytes")
-        return path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
-        raise ValueError(_MISSING) from None
-    except OSError as error:
-        raise ValueError(f"cannot be read ({error.strerror or error})") from None
-
-
-def _json(path: Path) -> Any:
-    """A JSON file's value; raises as `_read` does."""
-    text = _read(path, _LARGEST_DOCUMENT)
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        raise ValueError("is no JSON") from None
-
-
-def _canonical(value: Any) -> str:
-    """A text that is the same for JSON values of the same content and types only."""
-    return json.dumps(value, sort_keys=True)
-
-
-def _put(root: Path, name: str, text: bytes) -> None:
-    """A file's bytes in one stroke, on the disk when this returns."""
-    _make_way(root, name)
-    file = root / name
-    if not os.path.isfile(file) or file.is_symlink():
-        _remove(file)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    draft = file.with_name(f"{file.name}.{secrets.token_hex(4)}.partial")
-    try:
-        draft.write_bytes(text)
-        _sync(draft)
-        os.replace(draft, file)
-    except BaseException:
-        draft.unlink(missing_ok=True)
-        raise
-    _sync_up(root, name)
-
-
-def _clear(root: Path, name: str) -> None:
-    """Removes what stands in a file's place, or in that of a directory above it."""
-    _make_way(root, name)
-    _remove(root / name)
-
-
-def _make_way(root: Path, name: str) -> None:
-    for above in [*reversed((root / name).relative_to(root).parents)][1:]:
-        if os.path.lexists(root / above) and not os.path.isdir(root / above):
-            _remove(root / above)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _sync_up(root: Path, name: str) -> None:
-    """Waits until the directories above a file are on the disk."""
-    for above in Path(name).parents:
-        _sync(root / above)
-
-
-def _sync(place: Path) -> None:
-    handle = os.open(place, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

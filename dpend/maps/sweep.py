@@ -89,7 +89,7 @@ def sweep(
     example = "functools.partial(dpend.chaos.lyapunov, duration=10.0)"
     function("quantity", quantity, "(pendulum, state, scheme)", example)
     keyed = Keyed.of(quantity)
-    grid = Grid.checked(pendulum, axes, {} if at is None else at)
+    grid = Grid.of(pendulum, axes, {} if at is None else at)
     most = known_number("most_steps", most_steps, positive=True)
     if most > COUNTABLE:
         raise ValueError(f"most_steps must be at most {COUNTABLE:g}, got {most:g}: give fewer")

@@ -114,7 +114,7 @@ def _tile_values(
     shape = tuple(part.stop - part.start for part in block)
     if parities is None:
         return _lane_values(work, block, np.ones(shape, bool))
-    known = {key: grid.turned(array) for key, array in done(grid.reflected(block)).items()}
+    known = {key: grid.flip(array) for key, array in done(grid.reflected(block)).items()}
     fresh = known["status"] == Status.NOT_COMPUTED
     places = np.meshgrid(*(np.arange(part.start, part.stop) for part in block), indexing="ij")
     images = [

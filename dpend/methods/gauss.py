@@ -6,8 +6,10 @@ The energy error does not grow with time, but for a part that vanishes exponenti
 with the rounding errors of all sums so far, which the next sum takes back.
 """
 
+import math
+from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,20 +18,41 @@ from jax.flatten_util import ravel_pytree
 
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, State, vector_field
-from dpend.methods.runge_kutta import GAUSS, ROOT15, displaced
+from dpend.methods.runge_kutta import (
+    Form,
+    Step,
+    Tableau,
+    add_compensated,
+    displaced,
+    for_each_tangent,
+)
+
+# Collocation at the three Gauss-Legendre nodes (Hairer, Norsett and Wanner, Solving Ordinary
+# Differential Equations I): a row of `a` has as many entries as there are stages.
+_ROOT15 = math.sqrt(15.0)
+GAUSS = Tableau(
+    a=(
+        (5 / 36, 2 / 9 - _ROOT15 / 15, 5 / 36 - _ROOT15 / 30),
+        (5 / 36 + _ROOT15 / 24, 2 / 9, 5 / 36 - _ROOT15 / 24),
+        (5 / 36 + _ROOT15 / 30, 2 / 9 + _ROOT15 / 15, 5 / 36),
+    ),
+    b=(5 / 18, 4 / 9, 5 / 18),
+    order=6,
+)
 
 # a_ij/b_j. The method is symplectic where b_i a_ij + b_j a_ji = b_i b_j, that is where the shares
 # of ij and of ji add up to 1, and symmetric in time where those of ij and of (4 - i)(4 - j) do.
 # These doubles do both to the last bit; a_ij themselves are off by 1e-17, and so would the energy
 # be, in one direction, period by period.
-_NEAR, _FAR = 0.5 + 0.15 * ROOT15, 0.5 + 0.12 * ROOT15
+_NEAR, _FAR = 0.5 + 0.15 * _ROOT15, 0.5 + 0.12 * _ROOT15
 _SHARES = ((0.5, 1.0 - _NEAR, 1.0 - _FAR), (_NEAR, 0.5, 1.0 - _NEAR), (_FAR, _NEAR, 0.5))
-# An iteration that has come this near [rad] and gets no nearer has met rounding; one that has not
-# in so many rounds finds no solution.
-_NEARLY, _MOST_ROUNDS = 1e-9, 100
+# An iteration whose changes are this small [rad] and get no smaller has met rounding.
+_NEARLY = 1e-9
+# An iteration of so many rounds finds no solution.
+_MOST_ROUNDS = 100
 
 
-class Summed(NamedTuple):
+class _Summed(NamedTuple):
     """A state, and what rounding has taken from its sums: the two together are the motion
     (compensated summation).
     """
@@ -86,13 +109,18 @@ def _gauss_slopes(pendulum: Pendulum, dt: Scalar, state: State) -> tuple[State, 
     return jax.tree.map(lambda leaf: jnp.where(end.size <= _NEARLY, leaf, jnp.nan), end.slopes)
 
 
-def _at_stages(
-    pendulum: Pendulum, dt: Scalar, state: State, slopes: tuple[State, ...]
-) -> tuple[State, ...]:
-    steps = [
+def _weighted(dt: Scalar, slopes: Sequence[State]) -> list[State]:
+    """dt b_j k_j of every stage."""
+    return [
         jax.tree.map(partial(jnp.multiply, dt * b), slope)
         for b, slope in zip(GAUSS.b, slopes, strict=True)
     ]
+
+
+def _at_stages(
+    pendulum: Pendulum, dt: Scalar, state: State, slopes: tuple[State, ...]
+) -> tuple[State, ...]:
+    steps = _weighted(dt, slopes)
     return tuple(vector_field(pendulum, displaced(state, row, steps)) for row in _SHARES)
 
 
@@ -103,7 +131,9 @@ def _gauss_leaves(pendulum: list[Scalar], dt: Scalar, state: list[Scalar]) -> li
 
 
 @_gauss_leaves.defjvp
-def _gauss_leaves_jvp(primals, tangents):  # type: ignore[no-untyped-def]
+def _gauss_leaves_jvp(
+    primals: tuple[Any, ...], tangents: tuple[Any, ...]
+) -> tuple[list[Scalar], list[Scalar]]:
     """By the implicit function theorem: one linear system in place of the iteration."""
     leaves = _gauss_leaves(*primals)
     flat, tree = ravel_pytree(leaves)
@@ -119,15 +149,39 @@ def _gauss_leaves_jvp(primals, tangents):  # type: ignore[no-untyped-def]
     return leaves, tree(jnp.linalg.solve(matrix, forcing))
 
 
-def gauss_step(constants: tuple[Pendulum, Scalar], point: Summed) -> Summed:
-    pendulum, dt = constants
-    leaves = _gauss_leaves(jax.tree.leaves(pendulum), dt, jax.tree.leaves(point.state))
-    slopes = [State(*leaves[i : i + 4]) for i in (0, 4, 8)]
-    steps = [
-        jax.tree.map(partial(jnp.multiply, dt * b), slope)
-        for b, slope in zip(GAUSS.b, slopes, strict=True)
-    ]
-    change = displaced(point.rest, (1.0,) * 3, steps)
-    state = jax.tree.map(jnp.add, point.state, change)
-    rest = jax.tree.map(lambda old, new, change: (old - new) + change, point.state, state, change)
-    return Summed(state, rest)
+class _SummedForm(Form):
+    """A canonical state with the rounding errors of its sums; its step is implicit, and leaves the
+    explicit one that it is given aside.
+    """
+
+    def enter(self, pendulum: Pendulum, state: State) -> _Summed:
+        return _Summed(state, jax.tree.map(jnp.zeros_like, state))
+
+    def leave(self, constants: tuple[Pendulum, Scalar], point: _Summed) -> State:
+        return point.state
+
+    def move(self, step: Step, constants: tuple[Pendulum, Scalar], point: _Summed) -> _Summed:
+        pendulum, dt = constants
+        leaves = _gauss_leaves(jax.tree.leaves(pendulum), dt, jax.tree.leaves(point.state))
+        slopes = [State(*leaves[i : i + 4]) for i in (0, 4, 8)]
+        return _Summed(
+            *add_compensated(point.state, displaced(point.rest, (1.0,) * 3, _weighted(dt, slopes)))
+        )
+
+    def move_compensated(
+        self, step: Step, constants: tuple[Pendulum, Scalar], point: _Summed, rest: _Summed
+    ) -> tuple[_Summed, _Summed]:
+        return self.move(step, constants, point), rest  # a point holds a rest of its own
+
+    def move_tangents(
+        self, step: Step, constants: tuple[Pendulum, Scalar], point: _Summed, tangents: State
+    ) -> tuple[_Summed, State]:
+        def move_tangent(tangent: State) -> tuple[_Summed, State]:
+            both = _Summed(tangent, jax.tree.map(jnp.zeros_like, tangent))
+            ahead, change = jax.jvp(partial(self.move, step, constants), (point,), (both,))
+            return ahead, jax.tree.map(jnp.add, change.state, change.rest)
+
+        return for_each_tangent(move_tangent, tangents, point.state)
+
+
+SUMMED = _SummedForm()

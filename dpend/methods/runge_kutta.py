@@ -1,10 +1,11 @@
-"""Explicit Runge-Kutta methods of order 4, 8 and 10: their tableaus, one step, and the canonical
-form of it.
+"""Explicit Runge-Kutta methods of order 4, 8 and 10, and `Form`: the variables in which a method
+steps.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import jax
@@ -17,6 +18,16 @@ from dpend.mechanics.pendulum import Pendulum, State, vector_field
 
 # What a step moves: a pytree of scalars, the form's own.
 Point: TypeAlias = Any
+# What steps need of the pendulum and of their length: a pytree, the form's own.
+Constants: TypeAlias = Any
+# `explicit_step` of a tableau: (increment, point) -> the point one step later.
+Step: TypeAlias = Callable[..., Point]
+
+# Up to this many stages are written out in every form, without the zeros of the tableau. Beyond it
+# the canonical form runs them as a loop, unless a scheme says otherwise: order 8 written out takes
+# XLA six times as long to compile, and runs 1.5 times as fast for one trajectory but several times
+# as fast for many at once.
+WRITTEN_OUT = 4
 
 
 @dataclass(frozen=True)
@@ -119,12 +130,6 @@ RK10 = Tableau(
 )
 # fmt: on
 
-# Up to this many stages are written out, the zeros of the tableau left out with them. Beyond it the
-# stages run as a loop unless a scheme says otherwise: order 8 written out takes XLA six times as
-# long to compile and runs 1.5 times as fast for one trajectory, but several times as fast for many
-# at once.
-WRITTEN_OUT = 4
-
 
 def explicit_step(
     tableau: Tableau,
@@ -195,20 +200,73 @@ def _square(tableau: Tableau) -> list[list[float]]:
     return [[*row, *[0.0] * (stages - len(row))] for row in tableau.a]
 
 
-def canonical_increment(constants: tuple[Pendulum, Scalar], state: State) -> State:
-    pendulum, dt = constants
-    return jax.tree.map(lambda slope: dt * slope, vector_field(pendulum, state))
+def add_compensated(point: Point, change: Point) -> tuple[Point, Point]:
+    """point + change, and what rounding takes from that sum (compensated summation)."""
+    ahead = jax.tree.map(jnp.add, point, change)
+    return ahead, jax.tree.map(lambda old, new, change: (old - new) + change, point, ahead, change)
 
 
-# Collocation at the three Gauss-Legendre nodes (Hairer, Norsett and Wanner, Solving Ordinary
-# Differential Equations I): rows of `a` have as many entries as there are stages.
-ROOT15 = math.sqrt(15.0)
-GAUSS = Tableau(
-    a=(
-        (5 / 36, 2 / 9 - ROOT15 / 15, 5 / 36 - ROOT15 / 30),
-        (5 / 36 + ROOT15 / 24, 2 / 9, 5 / 36 - ROOT15 / 24),
-        (5 / 36 + ROOT15 / 30, 2 / 9 + ROOT15 / 15, 5 / 36),
-    ),
-    b=(5 / 18, 4 / 9, 5 / 18),
-    order=6,
-)
+class Form:
+    """The variables in which a method steps: here the canonical ones, where a point is a `State`.
+
+    Attributes:
+        written_out: whether the stages of a step are written out whatever their number.
+    """
+
+    written_out = False
+
+    def enter(self, pendulum: Pendulum, state: State) -> Point:
+        """The point that stands for a state."""
+        return state
+
+    def leave(self, constants: Constants, point: Point) -> State:
+        """The state that a point stands for."""
+        state: State = point
+        return state
+
+    def constants(self, pendulum: Pendulum) -> Constants:
+        """What steps of 1 s need."""
+        return pendulum, 1.0
+
+    def with_step(self, constants: Constants, dt: Scalar) -> Constants:
+        """What steps of `dt` [s] need, from what those of 1 s need."""
+        return constants[0], dt
+
+    def increment(self, constants: Constants, point: Point) -> Point:
+        """The slope at a point times the step."""
+        pendulum, dt = constants
+        return jax.tree.map(lambda slope: dt * slope, vector_field(pendulum, point))
+
+    def move(self, step: Step, constants: Constants, point: Point) -> Point:
+        """The point one step later."""
+        return step(partial(self.increment, constants), point)
+
+    def move_compensated(
+        self, step: Step, constants: Constants, point: Point, rest: Point
+    ) -> tuple[Point, Point]:
+        """The point one step later, and what rounding has taken from its sums so far."""
+        change = step(partial(self.increment, constants), point, onto=rest)
+        return add_compensated(point, change)
+
+    def move_tangents(
+        self, step: Step, constants: Constants, point: Point, tangents: State
+    ) -> tuple[Point, State]:
+        """The point one step later, and its tangents: the step itself is differentiated."""
+
+        def move_tangent(tangent: State) -> tuple[State, State]:
+            return jax.jvp(partial(self.move, step, constants), (point,), (tangent,))
+
+        return for_each_tangent(move_tangent, tangents, point)
+
+
+def for_each_tangent(
+    move_tangent: Callable[[State], tuple[Point, State]], tangents: State, state: State
+) -> tuple[Point, State]:
+    """`move_tangent` of one tangent, or of all along the axis that `tangents` have before those of
+    `state`.
+    """
+    many = jnp.ndim(tangents.theta1) > jnp.ndim(state.theta1)
+    return jax.vmap(move_tangent, out_axes=(None, 0))(tangents) if many else move_tangent(tangents)
+
+
+CANONICAL = Form()

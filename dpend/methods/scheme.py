@@ -1,20 +1,9 @@
-"""One step of each integration method, and `Scheme`, the static pair of method and step that names
-a computation.
+"""`Scheme`, the static pair of method and step that names a computation, and the scheme that a
+tolerance needs.
 
 A step is traceable in the pendulum, the point and the step itself; forward and reverse derivatives
-go through it. The point that a step moves is not always a `State`. There are two forms:
-
-- canonical: the `State` itself, (theta, p);
-- circle: sine and cosine of both angles are carried as state, s' = c omega and c' = -s omega, and
-  the angles are two more sums that nothing depends on. No step computes a sine, which is half of
-  the canonical form's work. Another discretisation of the same equations: s^2 + c^2 = 1 holds to
-  the method's error, no better.
-
-`gauss` is implicit, of order 6 and symplectic: the energy error does not grow with time, but for a
-part that vanishes exponentially with the step (the paper's orbit at 40 degrees loses 2e-14 of its
-energy a period with 40 steps in it, 1e-17 with 60), and one of 2e-18 to 1e-17 a period whose cause
-is not known. Its point is a canonical state with the rounding errors of all sums so far, which the
-next sum takes back.
+go through it. The point that a step moves is not always a `State`: each method has a `Form`, which
+is the canonical one (runge_kutta), the circle (circle), or canonical with compensated sums (gauss).
 
 The rescaled method takes equal steps in a time s of its own, dt/ds = u^(-5/8) with u = 1 + 0.85
 q/omega_f^2, q = omega1^2 + omega2^2 + (omega1 - omega2)^2 and omega_f the fast normal mode's
@@ -26,58 +15,102 @@ cost what those of an even step cost.
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from dpend.checks import Scalar, flag, instance, known_number, one_of
 from dpend.mechanics.pendulum import Pendulum, State, fast_frequency, hamiltonian, known_pendulum
-from dpend.methods.circle import (
-    Tangent,
-    circle_constants,
-    circle_increment,
-    spin_of,
-    tangent_increment,
-    to_circle,
-)
-from dpend.methods.gauss import Summed, gauss_step
+from dpend.methods.circle import CIRCLE, spin_of
+from dpend.methods.gauss import GAUSS, SUMMED
 from dpend.methods.runge_kutta import (
-    GAUSS,
+    CANONICAL,
     RK4,
     RK8,
     RK10,
     WRITTEN_OUT,
+    Constants,
+    Form,
     Point,
+    Step,
     Tableau,
-    canonical_increment,
     explicit_step,
 )
 
 
 class _Method(NamedTuple):
     tableau: Tableau
-    circle: bool  # or canonical
+    form: Form
     even: bool = True  # steps equally long in time
-    implicit: bool = False
 
 
 # Every method by name.
 METHODS = {
-    "rk4": _Method(RK4, False),
-    "rk8": _Method(RK8, False),
-    "rk4-circle": _Method(RK4, True),
-    "rk8-circle": _Method(RK8, True),
-    "rk8-circle-rescaled": _Method(RK8, True, even=False),
-    "rk10-circle-rescaled": _Method(RK10, True, even=False),
-    "gauss": _Method(GAUSS, False, implicit=True),
+    "rk4": _Method(RK4, CANONICAL),
+    "rk8": _Method(RK8, CANONICAL),
+    "rk4-circle": _Method(RK4, CIRCLE),
+    "rk8-circle": _Method(RK8, CIRCLE),
+    "rk8-circle-rescaled": _Method(RK8, CIRCLE, even=False),
+    "rk10-circle-rescaled": _Method(RK10, CIRCLE, even=False),
+    "gauss": _Method(GAUSS, SUMMED),
 }
 # A release near the bottom swings slowly and evenly: it is given longer steps, in proportion to
 # (energy above the bottom)^-0.2, at most these times as long. Measured on releases over the whole
 # square.
 _PACE_POWER, _LONGEST_PACE = -0.2, 1.9
+# A week of one motion at two million steps a second: what takes longer does not end.
+_MOST_STEPS = 1e12
+# The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th
+# percentile over 64 x 64 releases from rest on the whole square, after 2 s of the paper's pendulum,
+# nearly two periods of its slow mode (experiments/speed_vs_error.py). At no error was another
+# method faster.
+_ERROR_OF_STEP = {
+    "rk8-circle-rescaled": (
+        (0.17, 1.3e-9),
+        (0.20, 5.1e-9),
+        (0.23, 1.8e-8),
+        (0.26, 5.0e-8),
+        (0.30, 1.6e-7),
+        (0.35, 5.9e-7),
+        (0.40, 1.7e-6),
+        (0.47, 6.6e-6),
+        (0.55, 2.1e-5),
+        (0.65, 1.5e-4),
+        (0.80, 1.7e-3),
+        (1.00, 3.1e-2),
+    ),
+    "rk10-circle-rescaled": (
+        (0.15, 2.0e-11),
+        (0.16, 2.6e-11),
+        (0.18, 3.8e-11),
+        (0.20, 8.8e-11),
+        (0.225, 2.8e-10),
+        (0.25, 8.1e-10),
+        (0.28, 2.6e-9),
+        (0.31, 7.3e-9),
+        (0.35, 2.9e-8),
+        (0.40, 1.2e-7),
+    ),
+}
+# Below this error [rad] order 10 is the faster, by 1.2 at 3e-11; above it they are alike, and order
+# 8 compiles sooner.
+_ORDER_10_BELOW = 2e-8
+# How much shorter the step has to be for other pendulums than the paper's, whose masses are equal:
+# against m2/m1, from the error at one step on the same releases; and at lengths l2/l1 = 0.25 to 4
+# at most by (l2/l1)^0.15.
+_SHORTER_FOR_MASSES = (
+    (0.01, 0.60),
+    (0.03, 0.68),
+    (0.1, 0.77),
+    (0.3, 0.91),
+    (1.0, 1.0),
+    (3.0, 0.73),
+    (10.0, 0.46),
+    (30.0, 0.28),
+    (100.0, 0.17),
+)
 
 
 @dataclass(frozen=True)
@@ -123,58 +156,39 @@ class Scheme:
         return METHODS[self.name].even
 
     @property
-    def _circle(self) -> bool:
-        return METHODS[self.name].circle
+    def _form(self) -> Form:
+        return METHODS[self.name].form
 
     @property
-    def _implicit(self) -> bool:
-        return METHODS[self.name].implicit
-
-    @property
-    def _rolled(self) -> bool:
-        if self.written_out is None:
-            return not self._circle and len(METHODS[self.name].tableau.b) > WRITTEN_OUT
-        return not self.written_out
+    def _step(self) -> Step:
+        tableau, written_out = METHODS[self.name].tableau, self.written_out
+        if written_out is None:
+            written_out = self._form.written_out or len(tableau.b) <= WRITTEN_OUT
+        return partial(explicit_step, tableau, written_out=written_out)
 
     def enter(self, pendulum: Pendulum, state: State) -> Point:
-        """The method's own form of a state; `State` itself for methods in (theta, p)."""
-        if self._implicit:
-            return Summed(state, jax.tree.map(jnp.zeros_like, state))
-        return to_circle(pendulum, state) if self._circle else state
+        """The point that stands for a state; `State` itself for explicit methods in (theta, p)."""
+        return self._form.enter(pendulum, state)
 
-    def leave(self, constants: Any, point: Point) -> State:
+    def leave(self, constants: Constants, point: Point) -> State:
         """The state that a point stands for."""
-        if self._implicit:
-            return cast(State, point.state)
-        if not self._circle:
-            return cast(State, point)
-        return State(
-            point.theta1, point.theta2, constants.unit1 * point.rate1, constants.unit2 * point.rate2
-        )
+        return self._form.leave(constants, point)
 
-    def constants(self, pendulum: Pendulum, dt: Scalar = 1.0) -> Any:
+    def constants(self, pendulum: Pendulum, dt: Scalar = 1.0) -> Constants:
         """What steps of `dt` [s] need, computed once; dt may be negative."""
-        return self.lasting(circle_constants(pendulum) if self._circle else (pendulum, dt), dt)
+        return self.with_step(self._form.constants(pendulum), dt)
 
-    def lasting(self, constants: Any, dt: Scalar) -> Any:
+    def with_step(self, constants: Constants, dt: Scalar) -> Constants:
         """The constants of steps of `dt` [s], from those of steps of 1 s."""
-        if not self._circle:
-            return constants[0], dt
-        return constants._replace(
-            step=constants.step * dt, weight1=constants.weight1 * dt, weight2=constants.weight2 * dt
-        )
+        return self._form.with_step(constants, dt)
 
-    def move(self, constants: Any, point: Point) -> Point:
+    def move(self, constants: Constants, point: Point) -> Point:
         """The point one step later."""
-        if self._implicit:
-            return gauss_step(constants, point)
-        increment = circle_increment if self._circle else canonical_increment
-        tableau = METHODS[self.name].tableau
-        return explicit_step(
-            tableau, partial(increment, constants), point, written_out=not self._rolled
-        )
+        return self._form.move(self._step, constants, point)
 
-    def move_compensated(self, constants: Any, point: Point, rest: Point) -> tuple[Point, Point]:
+    def move_compensated(
+        self, constants: Constants, point: Point, rest: Point
+    ) -> tuple[Point, Point]:
         """The point one step later, the rounding errors of its sums kept (compensated summation).
 
         Arguments:
@@ -183,22 +197,12 @@ class Scheme:
         Returns:
             The point and the rest, which together are the motion.
         """
-        if self._implicit:
-            return self.move(constants, point), rest  # its points hold a rest of their own
-        increment = partial(circle_increment if self._circle else canonical_increment, constants)
-        tableau = METHODS[self.name].tableau
-        change = explicit_step(tableau, increment, point, written_out=not self._rolled, onto=rest)
-        ahead = jax.tree.map(jnp.add, point, change)
-        return ahead, jax.tree.map(
-            lambda old, new, change: (old - new) + change, point, ahead, change
-        )
+        return self._form.move_compensated(self._step, constants, point, rest)
 
-    def move_tangents(self, constants: Any, point: Point, tangents: State) -> tuple[Point, State]:
-        """One step of a point together with tangent vectors of it.
-
-        In (theta, p) the step itself is differentiated; the circle forms apply the method to the
-        variational equations along its own stages, which is the same but for the circle's drift,
-        and leaves four components of six. Neither changes the point.
+    def move_tangents(
+        self, constants: Constants, point: Point, tangents: State
+    ) -> tuple[Point, State]:
+        """One step of a point together with tangent vectors of it, which do not change the point.
 
         Arguments:
             tangents: (d theta1, d theta2, d p1, d p2) as a `State`: one vector, with leaves of the
@@ -206,42 +210,7 @@ class Scheme:
         Returns:
             The point and the tangents.
         """
-        if self._implicit:
-            return self._gauss_tangents(constants, point, tangents)
-        if not self._circle:
-            one = partial(jax.jvp, partial(self.move, constants), (point,))
-            many = jnp.ndim(tangents.theta1) > jnp.ndim(point.theta1)
-            return (
-                jax.vmap(lambda d: one((d,)), out_axes=(None, 0))(tangents)
-                if many
-                else one((tangents,))
-            )
-        rates = constants.per_unit1 * tangents.p1, constants.per_unit2 * tangents.p2
-        tangent = Tangent(tangents.theta1, tangents.theta2, *rates)
-        increment = partial(tangent_increment, constants)
-        tableau = METHODS[self.name].tableau
-        point, tangent = explicit_step(
-            tableau, increment, (point, tangent), written_out=not self._rolled
-        )
-        return point, State(
-            tangent.angle1,
-            tangent.angle2,
-            constants.unit1 * tangent.rate1,
-            constants.unit2 * tangent.rate2,
-        )
-
-    def _gauss_tangents(
-        self, constants: Any, point: Summed, tangents: State
-    ) -> tuple[Summed, State]:
-        def one(tangent: State) -> tuple[Summed, State]:
-            nothing = jax.tree.map(jnp.zeros_like, tangent)
-            moved, change = jax.jvp(
-                partial(gauss_step, constants), (point,), (Summed(tangent, nothing),)
-            )
-            return moved, jax.tree.map(jnp.add, change.state, change.rest)
-
-        many = jnp.ndim(tangents.theta1) > jnp.ndim(point.state.theta1)
-        return jax.vmap(one, out_axes=(None, 0))(tangents) if many else one(tangents)
+        return self._form.move_tangents(self._step, constants, point, tangents)
 
     def advance(self, pendulum: Pendulum, point: Point, dt: Scalar) -> Point:
         """The point one step of `dt` [s] later; `dt` may be negative."""
@@ -301,62 +270,6 @@ def check_scheme(scheme: Any) -> None:
     instance(
         "scheme", scheme, Scheme, 'dpend.Scheme("rk8", 1e-3) or dpend.scheme_for(pendulum, 1e-9)'
     )
-
-
-# A week of one motion at two million steps a second: what takes longer does not end.
-_MOST_STEPS = 1e12
-
-
-# The step in units of 1/(fast mode's frequency) against the error of the larger angle [rad]: 99th
-# percentile over 64 x 64 releases from rest on the whole square, after 2 s of the paper's pendulum,
-# nearly two periods of its slow mode (experiments/speed_vs_error.py). At no error was another
-# method faster.
-_ERROR_OF_STEP = {
-    "rk8-circle-rescaled": (
-        (0.17, 1.3e-9),
-        (0.20, 5.1e-9),
-        (0.23, 1.8e-8),
-        (0.26, 5.0e-8),
-        (0.30, 1.6e-7),
-        (0.35, 5.9e-7),
-        (0.40, 1.7e-6),
-        (0.47, 6.6e-6),
-        (0.55, 2.1e-5),
-        (0.65, 1.5e-4),
-        (0.80, 1.7e-3),
-        (1.00, 3.1e-2),
-    ),
-    "rk10-circle-rescaled": (
-        (0.15, 2.0e-11),
-        (0.16, 2.6e-11),
-        (0.18, 3.8e-11),
-        (0.20, 8.8e-11),
-        (0.225, 2.8e-10),
-        (0.25, 8.1e-10),
-        (0.28, 2.6e-9),
-        (0.31, 7.3e-9),
-        (0.35, 2.9e-8),
-        (0.40, 1.2e-7),
-    ),
-}
-# Below this error [rad] order 10 is the faster, by 1.2 at 3e-11; above it they are alike, and order
-# 8 compiles sooner.
-_ORDER_10_BELOW = 2e-8
-
-# How much shorter the step has to be for other pendulums than the paper's, whose masses are equal:
-# against m2/m1, from the error at one step on the same releases; and at lengths l2/l1 = 0.25 to 4
-# at most by (l2/l1)^0.15.
-_SHORTER_FOR_MASSES = (
-    (0.01, 0.60),
-    (0.03, 0.68),
-    (0.1, 0.77),
-    (0.3, 0.91),
-    (1.0, 1.0),
-    (3.0, 0.73),
-    (10.0, 0.46),
-    (30.0, 0.28),
-    (100.0, 0.17),
-)
 
 
 def scheme_for(pendulum: Pendulum | Any, tolerance: float | Any) -> Scheme:

@@ -31,12 +31,18 @@ from dpend.methods.scheme import Scheme, check_scheme
 from dpend.motion.integrate import march, step_size
 from dpend.status import Status
 
-# Steps of the differences, in units of the parameter: from where four extrapolations make a smooth
-# loss exact to where rounding is all there is.
-_LARGEST_STEP, _RATIO, _LEVELS = 2.0**-5, 4.0, 15
+# The largest step of the differences, in units of the parameter: four extrapolations from there
+# make a smooth loss exact.
+_LARGEST_STEP = 2.0**-5
+# Each step is so many times shorter than the one before.
+_RATIO = 4.0
+# So many steps: at the last of them rounding is all there is.
+_LEVELS = 15
 # A derivative below this share of the loss itself counts as zero.
 _NOTHING = 1e-7
 _MOTION = "(pendulum, state, duration, scheme)"
+# Times at which a horizon is looked for: a hundredth of it is known no better.
+_TIMES = 256
 # The disagreement that error estimates may hide, in units of them: they are good to a small factor.
 _DOUBT = 10.0
 
@@ -148,10 +154,8 @@ def check_gradient(
     """
     require_float64()
     function("loss", loss, "the parameters", "lambda x: x**2")
-    tolerance, reverse = (
-        known_number("tolerance", tolerance, positive=True),
-        flag("reverse", reverse),
-    )
+    tolerance = known_number("tolerance", tolerance, positive=True)
+    reverse = flag("reverse", reverse)
     point, tree = _flat(parameters)
     horizon = None if motion is None else gradient_horizon(*several("motion", motion, _MOTION, 4))
     value = jnp.asarray(loss(tree(point)))
@@ -163,33 +167,27 @@ def check_gradient(
     def of(x: Scalar) -> Scalar:
         return jnp.asarray(loss(tree(x)), jnp.float64)
 
-    forward = np.array(
-        [jax.jvp(of, (point,), (direction,))[1] for direction in jnp.eye(point.size)]
-    )
+    forward = np.array([jax.jvp(of, (point,), (unit,))[1] for unit in jnp.eye(point.size)])
     backward = np.full(point.size, np.nan)
     if reverse:
         _, pull = jax.vjp(of, point)
         backward = np.asarray(pull(jnp.ones(()))[0])
-    differences = np.array([_difference(of, np.asarray(point), i) for i in range(point.size)])
-    size = np.where(np.asarray(point) == 0, 1.0, np.abs(point))
-    own = max(
-        float(np.max(np.abs(differences[:, 0]) * size)),
-        _NOTHING * abs(float(value)),
-        np.finfo(float).tiny,
-    )
-    unit = max(float(np.max(np.abs(forward) * size)), own)
+    pairs = [_differentiate(of, np.asarray(point), i) for i in range(point.size)]
+    difference, errors = np.array(pairs).T
     analytic = [forward, backward] if reverse else [forward]
-    apart = max(float(np.max(np.abs(one - differences[:, 0]) * size)) / unit for one in analytic)
-    noise = float(np.max(differences[:, 1] * size)) / own
-    status = _verdict(
-        apart, noise, tolerance, horizon, all(np.all(np.isfinite(one)) for one in analytic)
-    )
+    size = np.where(np.asarray(point) == 0, 1.0, np.abs(point))
+    least = max(_NOTHING * abs(float(value)), np.finfo(float).tiny)
+    own = max(float(np.max(np.abs(difference) * size)), least)
+    unit = max(float(np.max(np.abs(forward) * size)), own)
+    apart = max(float(np.max(np.abs(one - difference) * size)) / unit for one in analytic)
+    noise = float(np.max(errors * size)) / own
+    status = _verdict(apart, noise, tolerance, horizon, bool(np.all(np.isfinite(analytic))))
     return GradientCheck(
         value=value,
         forward=tree(jnp.asarray(forward)),
         reverse=tree(jnp.asarray(backward)),
-        difference=tree(jnp.asarray(differences[:, 0])),
-        difference_error=tree(jnp.asarray(differences[:, 1])),
+        difference=tree(jnp.asarray(difference)),
+        difference_error=tree(jnp.asarray(errors)),
         disagreement=jnp.asarray(apart),
         difference_noise=jnp.asarray(noise),
         horizon=horizon,
@@ -218,18 +216,16 @@ def _flat(parameters: Any) -> tuple[Any, Callable[[Any], Any]]:
             f"parameters must be finite numbers, not traced by jit, got {shown(parameters)}: give "
             f"numbers"
         ) from None
-    if not sum(leaf.size for leaf in leaves) or not all(
-        np.all(np.isfinite(leaf)) for leaf in leaves
-    ):
+    finite = all(np.all(np.isfinite(leaf)) for leaf in leaves)
+    if not sum(leaf.size for leaf in leaves) or not finite:
         raise ValueError(
             f"parameters must be one finite number or more, got {shown(parameters)}: give others"
         )
-    return ravel_pytree(
-        jax.tree.unflatten(jax.tree.structure(parameters), [jnp.asarray(leaf) for leaf in leaves])
-    )
+    arrays = [jnp.asarray(leaf) for leaf in leaves]
+    return ravel_pytree(jax.tree.unflatten(jax.tree.structure(parameters), arrays))
 
 
-def _difference(of: Callable[[Any], Any], point: np.ndarray, i: int) -> tuple[float, float]:
+def _differentiate(of: Callable[[Any], Any], point: np.ndarray, i: int) -> tuple[float, float]:
     """The derivative along coordinate i by extrapolated central differences, and an estimate of its
     error.
     """
@@ -239,9 +235,8 @@ def _difference(of: Callable[[Any], Any], point: np.ndarray, i: int) -> tuple[fl
     above: list[float] = []  # the row for the step before: D, and its extrapolations
     for level in range(_LEVELS):
         ends = point[i] + np.array([1.0, -1.0]) * (unit * _LARGEST_STEP / _RATIO**level)
-        values = [
-            float(of(jnp.asarray(np.where(np.arange(point.size) == i, end, point)))) for end in ends
-        ]
+        points = [np.where(np.arange(point.size) == i, end, point) for end in ends]
+        values = [float(of(jnp.asarray(one))) for one in points]
         step, largest = ends[0] - ends[1], max(abs(value) for value in values)
         nothing = nothing if nothing > 0 else _NOTHING * largest / unit
         row = [(values[0] - values[1]) / step]
@@ -256,10 +251,6 @@ def _difference(of: Callable[[Any], Any], point: np.ndarray, i: int) -> tuple[fl
                 best, error, least = row[-1], doubt, relative
         above = row
     return best, error
-
-
-# Times at which they are looked at: a hundredth of the horizon is known no better.
-_TIMES = 256
 
 
 def gradient_horizon(
@@ -308,7 +299,9 @@ def gradient_horizon(
     state = jax.tree.map(partial(jnp.asarray, dtype=jnp.float64), state)
     growth, error = (
         np.asarray(part)[: len(marks)]
-        for part in _compared(pendulum, state, step_size(known, steps), jnp.asarray(counts), method)
+        for part in _compare_tangents(
+            pendulum, state, step_size(known, steps), jnp.asarray(counts), method
+        )
     )
     error = np.maximum.accumulate(np.where(np.isfinite(error), error, np.inf))
     time = marks * (known / steps)
@@ -323,7 +316,7 @@ def gradient_horizon(
 
 
 @partial(jax.jit, static_argnames="method")
-def _compared(
+def _compare_tangents(
     pendulum: Pendulum, state: State, dt: Scalar, counts: Scalar, method: Scheme
 ) -> tuple[Scalar, Scalar]:
     """Growth and relative error of the tangents at the start and after each of `counts` steps

@@ -183,7 +183,7 @@ def _unevenly(shown, pendulum, state, along, duration, scheme):  # type: ignore[
         dt = jnp.where(lost, jnp.nan, jnp.where(last, rest, sense * dt))
         dt = jnp.where(live, dt, 0.0)
         time = jnp.where(last & ~lost, duration, time + dt)
-        ahead = shown(scheme.lasting(unit, dt), along, time, dt)
+        ahead = shown(scheme.with_step(unit, dt), along, time, dt)
         kept = jax.tree.map(partial(jnp.where, live), ahead[1:], along[1:])
         return _Along(ahead.point, *kept), time, spin
 

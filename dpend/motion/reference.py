@@ -13,9 +13,16 @@ from dpend._runtime import require_float64
 from dpend.checks import Scalar, flag, integer, known_value, number, numbers, shown, single
 from dpend.mechanics.pendulum import Pendulum, State, check_motion, fast_frequency, vector_field
 from dpend.mechanics.trig import LARGEST_ANGLE
-from dpend.motion.estimate import EPS, angle_error, count_roundings, fastest_rod, growth_along
+from dpend.motion.estimate import (
+    EPS,
+    angle_error,
+    count_roundings,
+    energy_drift,
+    fastest_rod,
+    growth_along,
+)
 from dpend.motion.integrate import float64
-from dpend.motion.simulate import Trajectory, energy_drift
+from dpend.motion.simulate import Trajectory
 from dpend.status import Status
 
 # Steps, if nobody asks for more: at 20 microseconds each they take half a minute, as the most steps

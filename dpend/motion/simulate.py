@@ -2,7 +2,8 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,22 +17,19 @@ from dpend.checks import (
     flag,
     integer,
     known_number,
-    number,
+    known_value,
     one_of,
     shown,
-    single,
 )
-from dpend.mechanics.pendulum import (
-    Pendulum,
-    State,
-    check_motion,
-    energy_scale,
-    fast_frequency,
-    hamiltonian,
-)
+from dpend.mechanics.pendulum import Pendulum, State, check_motion, fast_frequency
+from dpend.methods.runge_kutta import Point
 from dpend.methods.scheme import METHODS, Scheme
 from dpend.motion.estimate import (
     EPS,
+    LARGEST_TURN,
+    MARGIN,
+    NEAR_ROUNDING,
+    PARTED,
     SHEAR,
     Comparison,
     angle_error,
@@ -39,8 +37,9 @@ from dpend.motion.estimate import (
     compare,
     compare_motions,
     comparison_of,
-    fastest_of_all,
+    energy_drift,
     fastest_rod,
+    find_scheme,
 )
 from dpend.motion.integrate import (
     float64,
@@ -51,6 +50,17 @@ from dpend.motion.integrate import (
     without_turns,
 )
 from dpend.status import Status, message
+
+# Steps of a motion, if nobody asks for more: half a minute at order 8 with the second pass and all
+# states saved, and half a gigabyte.
+MOST_MOTION_STEPS = 2_000_000
+# The largest energy drift that passes for a given step, in units of the energy scale: far above
+# what a method loses at a sensible one.
+_LARGEST_DRIFT = 1e-6
+# Rows of the smallest table that a motion of unknown length is saved in; larger ones double.
+_LEAST_ROOM = 1024
+# The error that is asked for by default [rad].
+_TOLERANCE = 1e-9
 
 
 @jax.tree_util.register_dataclass
@@ -91,13 +101,13 @@ class Trajectory:
         estimate, tolerance = float(self.error_estimate), float(self.tolerance)
         mends = ["shorten it"] if chaotic else []
         if math.isnan(tolerance):
-            wish = f"{_PARTED:g} rad, where it has parted from the true motion"
+            wish = f"{PARTED:g} rad, where it has parted from the true motion"
             mends += [] if chaotic else ["use a smaller step"]
         else:
             wish = f"the tolerance of {tolerance:.2g} rad"
             wish += ", which is the default" if tolerance == _TOLERANCE else ""
-            if estimate < _PARTED:
-                mends += [f"ask for a tolerance of {1.05 * estimate / _MARGIN:.1e} rad or more"]
+            if estimate < PARTED:
+                mends += [f"ask for a tolerance of {1.05 * estimate / MARGIN:.1e} rad or more"]
         why = "the motion is chaotic, and errors of rounding have grown so far" if chaotic else ""
         why = why or (
             "the step is too large"
@@ -138,105 +148,91 @@ class Trajectory:
         return xarray.Dataset(data, {"time": time, **degrees}, attributes)
 
 
-# In one step a rod may turn, and the fast mode advance, by this much [rad]: beyond it neither
-# method resolves the motion, whatever the energy says.
-_LARGEST_TURN = 1.0
-# Steps of a motion, if nobody asks for more: half a minute at order 8 with the second pass and all
-# states saved, and half a gigabyte.
-MOST_MOTION_STEPS = 2_000_000
+class _Plan(NamedTuple):
+    """What a program is compiled for."""
 
-# An error of this many radians is no small error: the computed motion has parted from the true one.
-_PARTED = 0.1
+    scheme: Scheme
+    # Numbers of steps, and of steps between saves: they make scans, which have both derivatives.
+    counts: tuple[int, int] | None
+    # Without them: how many rows are saved, those left over repeating the last one.
+    room: int = 0
 
 
-def _saved(pendulum, state, dt, steps, scheme, save_every, room):  # type: ignore[no-untyped-def]
+def _save(
+    pendulum: Pendulum, state: State, dt: Scalar, plan: _Plan, counts: tuple[Scalar, Scalar]
+) -> tuple[Scalar, State, Scalar]:
     """Times and states at steps 0, save_every, 2 save_every, ..., steps, and the largest rate met
     on the way.
-
-    Counts that are ints make a scan, which has both derivatives. Traced ones fill a table of `room`
-    rows, those left over repeating the last, so that one program serves all counts.
     """
+    scheme, (steps, save_every) = plan.scheme, counts
     constants = scheme.constants(pendulum, dt)
 
-    def step(carry, time, dt):  # type: ignore[no-untyped-def]
+    def step(carry: tuple[Point, Scalar], time: Scalar, dt: Scalar) -> tuple[Point, Scalar]:
         point = scheme.move(constants, carry[0])
         return point, jnp.fmax(carry[1], fastest_rod(pendulum, scheme.leave(constants, point)))
 
-    def segment(carry, index, count):  # type: ignore[no-untyped-def]
-        carry = march(step, carry, dt, count, index)
+    def segment(
+        carry: tuple[Point, Scalar], first: Scalar, count: Scalar
+    ) -> tuple[tuple[Point, Scalar], jax.Array]:
+        carry = march(step, carry, dt, count, first)
         # One row to save, not four: XLA would copy four arrays whole at every save.
         return carry, jnp.stack(jax.tree.leaves(scheme.leave(constants, carry[0])))
 
-    first = jnp.stack(jax.tree.leaves(state))
+    def save(carry: tuple[Point, Scalar], index: Scalar) -> tuple[tuple[Point, Scalar], jax.Array]:
+        first = index * save_every
+        known = plan.counts is not None
+        count = save_every if known else jnp.clip(steps - first, 0, save_every)
+        return segment(carry, first, count)
+
+    start = jnp.stack(jax.tree.leaves(state))[None]
     carry = (scheme.enter(pendulum, state), fastest_rod(pendulum, state))
-    if room is not None:
-        index = jnp.arange(room)
-        last = -(-steps // save_every)
-
-        def save(i, carried):  # type: ignore[no-untyped-def]
-            carry, rows = carried
-            carry, row = segment(
-                carry, (i - 1) * save_every, jnp.minimum(save_every, steps - (i - 1) * save_every)
-            )
-            return carry, lax.dynamic_update_index_in_dim(rows, row, i, 0)
-
-        carry, rows = lax.fori_loop(1, last + 1, save, (carry, jnp.broadcast_to(first, (room, 4))))
-        rows = jnp.where(index[:, None] <= last, rows, rows[last])
-        return jnp.minimum(index * save_every, steps).astype(float) * dt, State(*rows.T), carry[1]
-    full, rest = divmod(steps, save_every)
-    at = np.arange(full + 1) * save_every
-    carry, rows = lax.scan(lambda c, i: segment(c, i, save_every), carry, jnp.asarray(at[:-1]))
-    rows = jnp.concatenate([first[None], rows])
+    full, rest = (plan.room - 1, 0) if plan.counts is None else divmod(steps, save_every)
+    carry, rows = lax.scan(save, carry, jnp.arange(full))
+    rows = jnp.concatenate([start, rows])
     if rest:
-        at = np.append(at, steps)
         carry, last = segment(carry, full * save_every, rest)
         rows = jnp.concatenate([rows, last[None]])
-    return jnp.asarray(at, jnp.float64) * dt, State(*rows.T), carry[1]
+    at = jnp.minimum(jnp.arange(len(rows)) * save_every, steps)
+    return at.astype(float) * dt, State(*rows.T), carry[1]
 
 
-def _simulated(  # type: ignore[no-untyped-def]
-    pendulum, state, duration, steps, scheme, save_every, room, compared, tolerance, drift_tolerance
-):
+@partial(jax.jit, static_argnames="plan")
+def _simulate(
+    pendulum: Pendulum,
+    state: State,
+    duration: Scalar,
+    plan: _Plan,
+    counts: tuple[Scalar, Scalar],
+    compared: Comparison | None,
+    tolerance: Scalar,
+) -> Trajectory:
+    """The motion and its status; `counts` count where `plan` has none."""
+    steps, _ = counts = plan.counts or counts
     dt = step_size(duration, steps)
     reduced, turns = without_turns(state)
-    time, states, rate = _saved(pendulum, reduced, dt, steps, scheme, save_every, room)
+    time, states, rate = _save(pendulum, reduced, dt, plan, counts)
     drift = energy_drift(pendulum, states)
     if compared is None:
-        compared = compare_motions(*lax.stop_gradient((pendulum, state, dt)), steps, scheme)
+        compared = compare_motions(*lax.stop_gradient((pendulum, state, dt)), steps, plan.scheme)
     end = jax.tree.map(lambda leaf: leaf[-1], states)
     # Two programs may round otherwise; what that makes is an error, too.
     estimate = compared.estimate + angle_error(end, compared.end)
     states = with_turns(states, turns)
-    finite = jax.tree.reduce(
-        lambda ok, leaf: ok & jnp.all(jnp.isfinite(leaf)), states, jnp.asarray(True)
-    )
-    wanted = jnp.where(jnp.isnan(tolerance), _PARTED, tolerance)
-    growth = compared.floor / EPS
+    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(states)]
     regular = SHEAR * (1.0 + fast_frequency(pendulum) * jnp.abs(duration))
-    chaotic = (growth > regular) & (estimate < _NEAR_ROUNDING * compared.floor)
+    chaotic = compared.floor / EPS > regular
+    chaotic &= estimate < NEAR_ROUNDING * compared.floor
+    by_step = jnp.isnan(tolerance)
     why = jnp.where(chaotic, Status.BEYOND_HORIZON, Status.TOLERANCE_NOT_REACHED)
-    status = jnp.where(estimate > wanted, why, Status.CONVERGED)
-    status = jnp.where(drift > drift_tolerance, Status.DRIFT_ABOVE_TOLERANCE, status)
-    status = jnp.where(finite, status, Status.NONFINITE)
+    is_far = estimate > jnp.where(by_step, PARTED, tolerance)
+    status = jnp.where(is_far, why, Status.CONVERGED)
+    status = jnp.where(by_step & (drift > _LARGEST_DRIFT), Status.DRIFT_ABOVE_TOLERANCE, status)
+    status = jnp.where(jnp.all(jnp.stack(finite)), status, Status.NONFINITE)
     turn = jnp.maximum(rate, fast_frequency(pendulum)) * jnp.abs(dt)
-    status = jnp.where(turn > _LARGEST_TURN, Status.STEP_TOO_LARGE, status)
-    return Trajectory(time, states, drift, estimate, jnp.asarray(steps), status, scheme, tolerance)
-
-
-_simulate = jax.jit(_simulated, static_argnames=("steps", "scheme", "save_every", "room"))
-_simulate_traced = jax.jit(_simulated, static_argnames=("scheme", "room"))
-
-# Errors of so many roundings of the start may be those of rounding, of more they are not. Those are
-# of some 30, but in one of ten cases of more than 100 to 300 (order 8, releases from the whole
-# square, 2 to 10 s).
-_NEAR_ROUNDING = 1e4
-
-
-def energy_drift(pendulum: Pendulum, states: State) -> Scalar:
-    """The largest |H - H(0)| along saved states, in units of the energy scale."""
-    energy = hamiltonian(pendulum, states)
-    start = jax.tree.map(lambda leaf: leaf[0], states)
-    return jnp.max(jnp.abs(energy - energy[0])) / energy_scale(pendulum, start)
+    status = jnp.where(turn > LARGEST_TURN, Status.STEP_TOO_LARGE, status)
+    return Trajectory(
+        time, states, drift, estimate, jnp.asarray(steps), status, plan.scheme, tolerance
+    )
 
 
 def simulate(
@@ -249,7 +245,6 @@ def simulate(
     tolerance: float | Any | None = None,
     save_every: int | Any = 1,
     error: bool | Any = True,
-    drift_tolerance: float | Any | None = None,
     most_steps: int | Any = MOST_MOTION_STEPS,
 ) -> Trajectory:
     """The motion from `state` over `duration`, with an estimate of its own error.
@@ -277,9 +272,6 @@ def simulate(
         save_every: every how many steps a state is saved; the last state always is.
         error: make the second pass at half the step. Without it `error_estimate` is NaN, at a third
             of the time. For a tolerance the search has made it.
-        drift_tolerance: largest energy drift, in units of the energy scale, that passes. By default
-            1e-6 for a step, far above what a method loses at a sensible one; for a tolerance any,
-            the error itself being known.
         most_steps: how many steps are taken at most. A step that makes more is refused; for a
             tolerance no shorter one is tried then.
     Returns:
@@ -302,134 +294,91 @@ def simulate(
     at_most_one(step=step, tolerance=tolerance)
     save_every, error = integer("save_every", save_every), flag("error", error)
     most_steps = integer("most_steps", most_steps)
-    method = (
-        ("rk8-circle" if step is None else "rk8")
-        if method is None
-        else one_of("method", method, tuple(METHODS))
-    )
-    if drift_tolerance is None:
-        drift_tolerance = math.inf if step is None else 1e-6
-    else:
-        drift_tolerance = number("drift_tolerance", drift_tolerance, positive=True)
-        single("drift_tolerance", drift_tolerance)
+    if method is None:
+        method = "rk8-circle" if step is None else "rk8"
+    method = one_of("method", method, tuple(METHODS))
     if not Scheme(method, 1.0).even:
         raise ValueError(
             f"method must take even steps to save states at, got {method!r}: give rk8-circle, or "
             f"use flow"
         )
     state = float64(state)
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, state)))
-    compared = None  # is made beside the motion
-    if step is None:
-        if traced:
-            raise ValueError(
-                "tolerance needs a state and a pendulum that are known, got traced ones: give a "
-                "step"
-            )
-        tolerance = known_number(
-            "tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad"
+    if step is not None:
+        scheme = Scheme(method, step)
+        return _by_step(pendulum, state, duration, scheme, save_every, error, most_steps)
+    if _is_traced(pendulum, state):
+        raise ValueError(
+            "tolerance needs a state and a pendulum that are known, got traced ones: give a step"
         )
-        scheme, compared = _scheme_reaching(pendulum, state, known, method, tolerance, most_steps)
-    else:
-        tolerance, scheme = math.nan, Scheme(method, step)
-        compared = None if error else comparison_of(math.nan)
-    steps = scheme.steps(known)
+    wish = _TOLERANCE if tolerance is None else tolerance
+    tolerance = known_number("tolerance", wish, positive=True, unit="rad")
+    return _to_tolerance(pendulum, state, duration, method, tolerance, save_every, most_steps)
+
+
+def _is_traced(pendulum: Pendulum, state: State) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, state)))
+
+
+def _known(duration: Scalar) -> float:
+    return cast(float, known_value(duration))
+
+
+def _count_steps(scheme: Scheme, duration: float, most_steps: int) -> int:
+    steps = scheme.steps(duration)
     if steps > most_steps:
         raise ValueError(
             f"step must make at most {most_steps:,} steps, got {scheme.step:g} s, which makes "
             f"{steps:,}: "
             "give a larger step, a shorter duration, or more most_steps"
         )
-    every = min(save_every, steps)
-    time = jnp.asarray(duration, jnp.float64)
-    if compared is None and not traced:  # by the one program for all numbers of steps
-        compared = compare(
-            pendulum, state, step_size(known, steps), jnp.asarray(steps), any_step(scheme)
-        )
-    if step is not None:
-        return _simulate(
-            pendulum, state, time, steps, scheme, every, None, compared, tolerance, drift_tolerance
-        )
-    # The number of steps being this motion's own, a program that were compiled for it would be used
-    # once.
-    rows = 1 + -(-steps // every)
-    room = max(_LEAST_ROOM, 1 << (rows - 1).bit_length())
-    counts = jnp.asarray(steps), jnp.asarray(every)
-    motion = _simulate_traced(
-        pendulum,
-        state,
-        time,
-        counts[0],
-        any_step(scheme),
-        counts[1],
-        room,
-        compared,
-        tolerance,
-        drift_tolerance,
-    )
-    time, states = jax.tree.map(
-        lambda rows_: jnp.asarray(np.asarray(rows_)[:rows]), (motion.time, motion.state)
-    )
-    return replace(motion, time=time, state=states, scheme=scheme)
+    return steps
 
 
-# Rows of the smallest table that a motion of unknown length is saved in; larger ones double.
-_LEAST_ROOM = 1024
-# The error that is asked for by default [rad].
-_TOLERANCE = 1e-9
-# The share of a tolerance that the search for a step aims at: an estimate may itself be off by a
-# tenth.
-_MARGIN = 0.8
-# The first step that is tried when one is sought [rad of the fastest motion at the start].
-_FIRST_TURN = 0.5
-# Below (rate dt)^p of this the truncation of a step is lost in rounding: a smaller step only adds
-# to that.
-_ONLY_ROUNDING = 1e-18
-# A motion that keeps its energy this well, in units of its scale, has steps that resolve it.
-_RESOLVED = 1e-10
-# What a rounding grows to is believed where two steps tell it within this factor.
-_ALIKE = 10.0
-
-
-def _scheme_reaching(
+def _by_step(
     pendulum: Pendulum,
     state: State,
-    duration: float,
+    duration: Scalar,
+    scheme: Scheme,
+    save_every: int,
+    error: bool,
+    most_steps: int,
+) -> Trajectory:
+    """The motion at a given step, by a program of its own."""
+    known = _known(duration)
+    steps = _count_steps(scheme, known, most_steps)
+    compared = None if error else comparison_of(math.nan)
+    if error and not _is_traced(pendulum, state):  # by the one program for all numbers of steps
+        dt = step_size(known, steps)
+        compared = compare(pendulum, state, dt, jnp.asarray(steps), any_step(scheme))
+    counts = steps, min(save_every, steps)
+    time = jnp.asarray(duration, jnp.float64)
+    return _simulate(pendulum, state, time, _Plan(scheme, counts), counts, compared, math.nan)
+
+
+def _to_tolerance(
+    pendulum: Pendulum,
+    state: State,
+    duration: Scalar,
     method: str,
     tolerance: float,
+    save_every: int,
     most_steps: int,
-) -> tuple[Scheme, Comparison]:
-    """The method with a step at which the error of this motion is below `tolerance`, or as small as
-    rounding or `most_steps` allow, and what a second pass told of it.
+) -> Trajectory:
+    """The motion at a step that reaches a tolerance.
+
+    The number of steps is this motion's own: a program that were compiled for it would be used
+    once.
     """
-    rate = float(fastest_of_all(pendulum, state))
-    if not math.isfinite(rate):
-        rate = 0.0  # whatever the step, the status will say so
-    steps = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN))
-    if steps > most_steps:
-        raise ValueError(
-            f"duration must be at most some {_FIRST_TURN * most_steps / rate:.1e} s for a "
-            f"tolerance, got {duration:g}, "
-            f"which takes {steps:.3g} steps or more: give a shorter one, a step, or more most_steps"
-        )
-    best, last, last_floor, fall, order = None, math.inf, math.inf, 1.0, Scheme(method, 1.0).order
-    while True:
-        scheme = Scheme(method, abs(duration) / steps)
-        dt, count = step_size(duration, steps), jnp.asarray(steps)
-        compared = compare(pendulum, state, dt, count, any_step(scheme))
-        error, floor, fastest, drift = (float(value) for value in compared[:4])
-        turn = scheme.step * np.fmax(rate, fastest)
-        if turn <= _LARGEST_TURN and not (best and best[0] < error):
-            best = error, scheme, compared
-        near = error < _PARTED  # to the true motion all along, or else at least to its energy
-        alike = (
-            last_floor / _ALIKE < floor < _ALIKE * last_floor
-        )  # too long a step makes growth of its own
-        lost = alike and floor > tolerance and (near or drift < _RESOLVED)
-        steady = alike and near and error < _NEAR_ROUNDING * floor and error > last * fall
-        found = turn <= _LARGEST_TURN and (error <= _MARGIN * tolerance or lost or steady)
-        missing = (2 * error / tolerance) ** (1 / order) if math.isfinite(error) else 4.0
-        more = min(max(missing, turn, 1.2), 4.0)
-        steps, last, last_floor, fall = math.ceil(steps * more), error, floor, more ** (-order / 2)
-        if found or turn < _ONLY_ROUNDING ** (1 / order) or steps > most_steps:
-            return (best or (error, scheme, compared))[1:]
+    known = _known(duration)
+    scheme, compared = find_scheme(pendulum, state, known, method, tolerance, most_steps)
+    steps = _count_steps(scheme, known, most_steps)
+    every = min(save_every, steps)
+    rows = 1 + -(-steps // every)
+    plan = _Plan(any_step(scheme), None, max(_LEAST_ROOM, 1 << (rows - 1).bit_length()))
+    counts = jnp.asarray(steps), jnp.asarray(every)
+    time = jnp.asarray(duration, jnp.float64)
+    motion = _simulate(pendulum, state, time, plan, counts, compared, tolerance)
+    time, states = jax.tree.map(
+        lambda table: jnp.asarray(np.asarray(table)[:rows]), (motion.time, motion.state)
+    )
+    return replace(motion, time=time, state=states, scheme=scheme)

@@ -17,7 +17,7 @@ import pytest
 
 import dpend
 from dpend import Pendulum, Status
-from dpend.maps import grid
+from dpend.maps import disk, grid
 from dpend.maps import store as stores
 
 AXES = {"theta1": np.arange(-2.0, 3.0), "theta2": np.array([-1.5, -0.5, 0.5, 1.5])}
@@ -55,9 +55,9 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_waiting_for_the_disk():
-    before, stores._sync = stores._sync, lambda place: None
+    before, disk.sync = disk.sync, lambda place: None
     yield
-    stores._sync = before
+    disk.sync = before
 
 
 def truth():

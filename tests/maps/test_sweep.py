@@ -16,7 +16,7 @@ from scipy.stats import ks_2samp
 
 import dpend
 from dpend import Pendulum, Status, chaos
-from dpend.maps import grid
+from dpend.maps import disk, grid
 from dpend.maps import store as stores
 
 FLIP = partial(chaos.flip, duration=3.0)
@@ -200,7 +200,7 @@ def test_a_store_that_cannot_be_written_to_is_read_if_it_is_finished(paper, tmp_
 def test_an_unfinished_store_is_finished_with_the_same_bytes(paper, tmp_path, monkeypatch):
     """Stopped at every tile in turn, one of them between its values and its status."""
     monkeypatch.setattr(grid, "_TILE", 7)
-    monkeypatch.setattr(stores, "_sync", lambda place: None)
+    monkeypatch.setattr(disk, "sync", lambda place: None)
     axes = {"theta1": SIDE, "theta2": SIDE}
     dpend.sweep(FLIP, paper, axes, store=tmp_path / "whole.zarr")
     write, stopped, tries = stores.Store._write_chunk, tmp_path / "stopped.zarr", 0
