@@ -10,7 +10,7 @@ class Status(IntEnum):
 
     sentence: str
 
-    def __new__(cls, value: int, sentence: str) -> "Status":
+    def __new__(cls, value: int, sentence: str = "") -> "Status":
         """A member is its number; the sentence is an attribute."""
         member = int.__new__(cls, value)
         member._value_, member.sentence = value, sentence

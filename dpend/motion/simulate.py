@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,7 @@ from dpend.motion.integrate import (
     with_turns,
     without_turns,
 )
+from dpend.records import variables
 from dpend.status import Status, message
 
 
@@ -70,7 +71,7 @@ class Trajectory:
         tolerance: the error that was asked for [rad]; NaN where a step was given.
     """
 
-    time: Scalar
+    time: Annotated[Scalar, "s"]
     state: State
     energy_drift: Scalar
     error_estimate: Scalar
@@ -113,19 +114,7 @@ class Trajectory:
         """
         import xarray
 
-        units = {"theta1": "rad", "theta2": "rad", "p1": "kg m^2/s", "p2": "kg m^2/s"}
-        data = {
-            name: ("time", np.asarray(getattr(self.state, name)), {"units": unit})
-            for name, unit in units.items()
-        }
-        degrees = {
-            f"{name}_deg": (
-                "time",
-                np.degrees(np.asarray(getattr(self.state, name))),
-                {"units": "degree"},
-            )
-            for name in ("theta1", "theta2")
-        }
+        data, degrees = variables(self.state, "time")
         attributes = {
             "energy_drift": float(self.energy_drift),
             "error_estimate_rad": float(self.error_estimate),
