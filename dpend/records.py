@@ -1,8 +1,13 @@
-"""Files: a place is tried before anything is computed, and a new file takes the old one's place
-only when whole.
+"""What results look like outside Python: units on their fields, records for JSON, columns for CSV
+and xarray, and files that take the old one's place only when whole.
+
+Degrees in files and on the command line, radians in Python and in xarray; the unit of a field says
+which name and which number that makes.
 """
 
 import contextlib
+import dataclasses
+import functools
 import json
 import math
 import os
@@ -13,9 +18,109 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from dpend.status import Status, message
+
 # The largest file that is read [bytes]: nearly half a million orbits as JSON, or five million
 # measured samples. Parsing takes about ten times as much memory, 2.5 GB.
 LARGEST_FILE = 1 << 28
+
+
+# How a unit ends a name in files, where angles are in degrees.
+_SUFFIXES = {
+    "": "",
+    "rad": "_deg",
+    "rad/s": "_deg_s",
+    "m": "_m",
+    "kg": "_kg",
+    "m/s^2": "_m_s2",
+    "1/s^2": "_s-2",
+    "kg m^2/s": "_kg_m2_s",
+    "s": "_s",
+    "J": "_J",
+}
+
+
+def units_of(kind: type) -> dict[str, Any]:
+    """The fields of a data class with their units, as `period: Annotated[Scalar, "s"]` has them.
+
+    A number without one has an empty unit; a tuple or a dictionary those of its parts by name.
+    """
+    return _units_of(kind)
+
+
+@functools.cache
+def _units_of(kind: type) -> dict[str, Any]:
+    fields = dataclasses.fields(kind)
+    return {field.name: getattr(field.type, "__metadata__", ("",))[0] for field in fields}
+
+
+def file_name(name: str, unit: str) -> str:
+    """A quantity's name in files: `theta1` in radians is `theta1_deg`."""
+    return name + _SUFFIXES[unit]
+
+
+def file_value(value: Any, unit: str) -> Any:
+    """A number, or an array as a list, as files have it: angles in degrees."""
+    return (np.degrees(value) if unit.startswith("rad") else np.asarray(value)).tolist()
+
+
+def record(result: Any, names: str = "") -> dict[str, Any]:
+    """What JSON says of a result: some fields and properties of it, or all fields.
+
+    A number bears the name and the unit that files give it, the status is told by its name, and a
+    part that is a result itself becomes a record.
+    """
+    units = units_of(type(result))
+    found: dict[str, Any] = {}
+    for name in names.split() or units:
+        if name == "message":
+            found[name] = getattr(result, name, None) or message(result.status)
+            continue
+        value, of = getattr(result, name), units.get(name, "")
+        if name == "status":
+            found[name] = Status(int(value)).name.lower()
+        elif isinstance(of, dict):
+            parts = value if isinstance(value, dict) else dict(zip(of, value, strict=True))
+            found[name] = {file_name(k, of[k]): file_value(v, of[k]) for k, v in parts.items()}
+        elif dataclasses.is_dataclass(value):
+            found[name] = record(value)
+        elif isinstance(value, tuple):
+            found[name] = [file_value(one, of) for one in value]
+        else:
+            found[file_name(name, of)] = file_value(value, of)
+    return found
+
+
+def columns(result: Any, names: str = "") -> dict[str, list[Any]]:
+    """The table of a result whose fields are arrays, by the names that files have; a field of
+    several parts, as an error, is a column for each.
+    """
+    found: dict[str, list[Any]] = {}
+    for name, column in record(result, names).items():
+        kind = name.removesuffix("_estimate")
+        if isinstance(column, dict):
+            stems = {key: key.rpartition("_") for key in column}
+            found |= {f"{a}_{kind}_{b}": column[key] for key, (a, _, b) in stems.items()}
+        else:
+            found[name] = column
+    return found
+
+
+def variables(result: Any, dim: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The fields of a result as xarray takes them, in SI over `dim`, and angles in degrees as
+    coordinates beside.
+    """
+    units = units_of(type(result))
+    values = {name: np.asarray(getattr(result, name)) for name in units}
+    data = {name: (dim, value, {"units": units[name]}) for name, value in values.items()}
+    degrees = {
+        f"{name}_deg": (dim, np.degrees(value), {"units": "degree"})
+        for name, value in values.items()
+        if units[name] == "rad"
+    }
+    return data, degrees
 
 
 @contextlib.contextmanager

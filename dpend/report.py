@@ -3,333 +3,217 @@
 import csv
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
 import dpend
-from dpend.catalogue.files import pendulum_record
 from dpend.checks import check_place
 from dpend.mechanics.pendulum import Pendulum
 from dpend.motion.simulate import Trajectory
 from dpend.orbits.orbit import PeriodicOrbit
-from dpend.records import json_text, replacing
-from dpend.status import Status
+from dpend.records import columns, json_text, record, replacing
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-
-def on_terminal() -> bool:
-    return sys.stderr is not None and sys.stderr.isatty()
+# Wider than any table here: a number is never broken to fit a terminal.
+_TABLE_WIDTH = 200
+# Rows of the table that stand for a family.
+_SHOWN_POINTS = 12
+# Columns of words, which begin at the left; numbers end at the right.
+_WORDS = ("", "symmetry", "stability", "family", "from", "to")
+# What a design tells the derivatives of: its name, what it is multiplied by, and its heading.
+_SLOPES = {
+    "period_s": ("period", 1.0, "period (s)"),
+    "kappa": ("kappa", 1.0, "kappa"),
+    "theta2_deg": ("theta2", math.degrees(1.0), "theta2 (deg)"),
+}
 
 
 def orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
-    angle_error, period_error = orbit.error_estimate
-    status = Status(int(orbit.status))
+    names = "period energy residual iterations status message symmetry kappa log_abs_kappa"
     return {
-        "theta1_deg": _degrees(orbit.theta1),
-        "theta2_deg": _degrees(orbit.theta2),
-        "period_s": float(orbit.period),
-        "energy_J": float(orbit.energy),
-        "residual": float(orbit.residual),
-        "iterations": int(orbit.iterations),
-        "status": status.name.lower(),
-        "message": dpend.message(status),
-        "symmetry": orbit.symmetry,
-        "kappa": float(orbit.kappa),
-        "log_abs_kappa": float(orbit.log_abs_kappa),
-        "stability": orbit.stability,
-        "dual": {
-            "theta1_deg": _degrees(orbit.dual.theta1),
-            "theta2_deg": _degrees(orbit.dual.theta2),
-        },
-        "turns": [int(turn) for turn in orbit.turns],
-        "error_estimate": {"theta2_deg": _degrees(angle_error), "period_s": float(period_error)},
-        "pendulum": pendulum_record(orbit.pendulum),
+        **record(orbit.state, "theta1 theta2"),
+        **record(orbit, f"{names} stability"),
+        "dual": record(orbit.dual, "theta1 theta2"),
+        **record(orbit, "turns error_estimate pendulum"),
     }
 
 
 def family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
-    orbits, status = family.orbits, Status(int(family.status))
-    columns = {
-        "arclength": family.arclength,
-        "theta1_deg": np.degrees(orbits.theta1),
-        "theta2_deg": np.degrees(orbits.theta2),
-        "period_s": orbits.period,
-        "energy_J": orbits.energy,
-        "kappa": orbits.kappa,
-        "log_abs_kappa": orbits.log_abs_kappa,
-        "theta2_error_deg": np.degrees(orbits.error_estimate[0]),
-        "period_error_s": orbits.error_estimate[1],
-    }
-    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
+    table = columns(family, "arclength")
+    table |= columns(family.orbits.state, "theta1 theta2")
+    table |= columns(family.orbits, "period energy kappa log_abs_kappa error_estimate")
+    points = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
     return {
         "branch": branch,
-        "points": [
-            dict(zip(columns, row, strict=True)) | {"symmetry": family.symmetry} for row in rows
-        ],
+        "points": [point | {"symmetry": family.symmetry} for point in points],
         "bifurcations": [
             {
-                "kind": point.kind,
-                "arclength": float(point.arclength),
-                "theta1_deg": _degrees(point.orbit.theta1),
-                "theta2_deg": _degrees(point.orbit.theta2),
-                "period_s": float(point.orbit.period),
-                "energy_J": float(point.orbit.energy),
-                "kappa": float(point.orbit.kappa),
+                **record(point, "kind arclength"),
+                **record(point.orbit.state, "theta1 theta2"),
+                **record(point.orbit, "period energy kappa"),
             }
             for point in family.special_points
         ],
-        "ends": list(family.ends),
-        "status": status.name.lower(),
-        "message": family.message,
-        "pendulum": pendulum_record(
-            Pendulum(*(leaf[0] for leaf in jax.tree.leaves(orbits.pendulum)))
-        ),
+        **record(family, "ends status message"),
+        "pendulum": record(jax.tree.map(lambda leaf: leaf[0], family.orbits.pendulum)),
     }
 
 
 def motion_record(motion: Trajectory) -> dict[str, Any]:
-    status = Status(int(motion.status))
     assert motion.scheme is not None
+    end = jax.tree.map(lambda leaf: leaf[-1], motion.state)
+    duration, steps = float(motion.time[-1]), int(motion.steps)
     return {
-        "final": {
-            "theta1_deg": _degrees(motion.state.theta1[-1]),
-            "theta2_deg": _degrees(motion.state.theta2[-1]),
-            "p1": float(motion.state.p1[-1]),
-            "p2": float(motion.state.p2[-1]),
-        },
-        "duration_s": float(motion.time[-1]),
-        "energy_drift": float(motion.energy_drift),
-        "error_estimate": float(motion.error_estimate),
-        "steps": int(motion.steps),
+        "final": {**record(end, "theta1 theta2"), "p1": float(end.p1), "p2": float(end.p2)},
+        "duration_s": duration,
+        **record(motion, "energy_drift error_estimate steps"),
         "method": motion.scheme.name,
-        "step_s": abs(float(motion.time[-1])) / int(motion.steps),
-        "status": status.name.lower(),
-        "tolerance": float(motion.tolerance),
-        "message": motion.message,
+        "step_s": abs(duration) / steps,
+        **record(motion, "status tolerance message"),
     }
 
 
 def design_record(
     found: dpend.Design, start: Pendulum, branches: tuple[str, ...], equations: tuple[str, ...]
 ) -> dict[str, Any]:
-    status = Status(int(found.status))
-    units = {
-        "theta2_deg": ("theta2", math.degrees(1.0)),
-        "period_s": ("period", 1.0),
-        "kappa": ("kappa", 1.0),
-    }
-    orbits = []
-    for i, (name, orbit) in enumerate(zip(branches, found.orbits, strict=True)):
-        slopes = {
-            key: {
-                parameter: unit * float(np.atleast_1d(row)[i])
-                for parameter, row in found.sensitivities[of].items()
-            }
-            for key, (of, unit) in units.items()
-        }
-        orbits.append(orbit_record(orbit) | {"branch": name, "sensitivities": slopes})
+    def slopes(key: str, i: int) -> dict[str, float]:
+        of, scale, _ = _SLOPES[key]
+        rows = found.sensitivities[of].items()
+        return {name: scale * float(np.atleast_1d(row)[i]) for name, row in rows}
+
+    orbits = [
+        orbit_record(orbit)
+        | {"branch": name, "sensitivities": {key: slopes(key, i) for key in _SLOPES}}
+        for i, (name, orbit) in enumerate(zip(branches, found.orbits, strict=True))
+    ]
     return {
-        "pendulum": pendulum_record(found.pendulum),
+        **record(found, "pendulum"),
         "orbits": orbits,
         "missed": dict(zip(equations, np.atleast_1d(found.loss).tolist(), strict=True)),
-        "distance": float(found.distance),
-        "at_bounds": list(found.at_bounds),
-        "iterations": int(found.iterations),
-        "looks": int(found.looks),
-        "status": status.name.lower(),
-        "message": found.message,
-        "start": pendulum_record(start),
+        **record(found, "distance at_bounds iterations looks status message"),
+        "start": record(start),
     }
-
-
-# How an estimate is shown: its name with its unit, and what it is multiplied by.
-_SHOWN = {
-    "l1": ("l1_m", 1.0),
-    "l2": ("l2_m", 1.0),
-    "m1": ("m1_kg", 1.0),
-    "m2": ("m2_kg", 1.0),
-    "g": ("g_m_s2", 1.0),
-    "l2/l1": ("l2/l1", 1.0),
-    "m2/m1": ("m2/m1", 1.0),
-    "g/l1": ("g/l1_s-2", 1.0),
-    "theta1": ("theta1_deg", math.degrees(1.0)),
-    "theta2": ("theta2_deg", math.degrees(1.0)),
-    "omega1": ("omega1_deg_s", math.degrees(1.0)),
-    "omega2": ("omega2_deg_s", math.degrees(1.0)),
-}
 
 
 def fit_record(fit: dpend.Fit) -> dict[str, Any]:
-    status = Status(int(fit.status))
     measured = np.sum(np.isfinite(fit.residual1)) + np.sum(np.isfinite(fit.residual2))
-
-    def shown(values: dict[str, Any]) -> dict[str, float]:
-        return {_SHOWN[name][0]: _SHOWN[name][1] * float(value) for name, value in values.items()}
-
     return {
-        "estimates": shown(fit.estimates),
-        "standard_errors": shown(fit.standard_errors),
-        "free": list(fit.free),
-        "noise_deg": _degrees(fit.noise),
-        "expected_noise_deg": _degrees(fit.expected_noise),
+        **record(fit, "estimates standard_errors free noise expected_noise"),
         "angles": int(measured),
         "duration_s": float(fit.time[-1] - fit.time[0]),
-        "windows": int(fit.windows),
-        "iterations": int(fit.iterations),
-        "gap": float(fit.gap),
-        "error_estimate": float(fit.error_estimate),
-        "status": status.name.lower(),
-        "message": dpend.message(status),
-        "pendulum": pendulum_record(fit.pendulum),
+        **record(fit, "windows iterations gap error_estimate status message pendulum"),
     }
 
 
-def _degrees(radians: Any) -> float:
-    return math.degrees(float(radians))
+def print_json(found: dict[str, Any]) -> None:
+    print(json_text(found))
 
 
-def print_json(record: dict[str, Any]) -> None:
-    print(json_text(record))
-
-
-# Wider than any table here: a number is never broken to fit a terminal.
-_TABLE_WIDTH = 200
-
-
-def _print_table(table: "Table") -> None:
+def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.console import Console
+    from rich.table import Table
 
+    table = Table(title=title, title_justify="left", title_style="")
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in _WORDS else "right")
+    for row in rows:
+        table.add_row(*row)
     console = Console(width=_TABLE_WIDTH, highlight=False)
     with console.capture() as text:
         console.print(table)
     print(text.get(), end="")
 
 
-def print_orbits(pendulum: Pendulum, found: dict[str | None, PeriodicOrbit]) -> None:
-    from rich.table import Table
+def _print_failure(found: dict[str, Any], whose: str = "") -> None:
+    if found["status"] != "converged":
+        print(f"{whose}{found['status']}: {found['message']}")
 
-    table = Table(title=_described(pendulum), title_justify="left", title_style="")
-    for heading in (
-        "",
-        "theta1 (deg)",
-        "theta2 (deg)",
-        "period (s)",
-        "stability",
-        "kappa",
-        "error (deg, s)",
-    ):
-        table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
-    failures = []
-    for name, orbit in found.items():
-        record = orbit_record(orbit)
-        error = record["error_estimate"]
-        table.add_row(
-            name or record["symmetry"],
-            f"{record['theta1_deg']:.10g}",
-            f"{record['theta2_deg']:.9f}",
-            f"{record['period_s']:.11f}",
-            record["stability"],
-            f"{record['kappa']:.6g}",
-            f"{error['theta2_deg']:.0e}, {error['period_s']:.0e}",
+
+def _describe(pendulum: Pendulum) -> str:
+    l1, l2, m1, m2, g = (f"{float(value):g}" for value in jax.tree.leaves(pendulum))
+    bobs = f"l1 = {l1} m, l2 = {l2} m, m1 = {m1} kg, m2 = {m2} kg"
+    return f"{bobs}, g = {g} m/s^2, released from rest"
+
+
+def print_orbits(pendulum: Pendulum, records: Sequence[dict[str, Any]]) -> None:
+    headings = ("", "theta1 (deg)", "theta2 (deg)", "period (s)", "stability", "kappa")
+    rows = [
+        (
+            one.get("branch") or one["symmetry"],
+            f"{one['theta1_deg']:.10g}",
+            f"{one['theta2_deg']:.9f}",
+            f"{one['period_s']:.11f}",
+            one["stability"],
+            f"{one['kappa']:.6g}",
+            "{theta2_deg:.0e}, {period_s:.0e}".format(**one["error_estimate"]),
         )
-        if record["status"] != "converged":
-            failures.append(f"{name or 'guess'}: {record['status']}: {record['message']}")
-    _print_table(table)
-    for failure in failures:
-        print(failure)
+        for one in records
+    ]
+    _print_table(_describe(pendulum), (*headings, "error (deg, s)"), rows)
+    for one in records:
+        _print_failure(one, f"{one.get('branch') or 'guess'}: ")
 
 
-# Rows of the table that stand for a family.
-_SHOWN_POINTS = 12
-
-
-def print_family(family: dpend.Family, record: dict[str, Any], out: Path | None) -> None:
-    from rich.table import Table
-
-    pendulum = Pendulum(*record["pendulum"].values())
-    table = Table(title=_described(pendulum), title_justify="left", title_style="")
-    headings = (
-        "theta1 (deg)",
-        "theta2 (deg)",
-        "period (s)",
-        "energy (J)",
-        "stability",
-        "log |kappa|",
-        "",
-    )
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in ("", "stability") else "right")
-    points = record["points"]
+def print_family(found: dict[str, Any], out: Path | None) -> None:
+    points = found["points"]
     chosen = np.unique(np.linspace(0, len(points) - 1, _SHOWN_POINTS).round().astype(int))
-    rows = [points[i] | {"kind": ""} for i in chosen]
-    for special in record["bifurcations"]:
-        logarithm = math.log(max(abs(special["kappa"]), sys.float_info.min))
-        rows.append(special | {"log_abs_kappa": logarithm})
-    for row in sorted(rows, key=lambda row: row["arclength"]):
-        marginal = row["kind"].startswith("stability")
-        table.add_row(
-            f"{row['theta1_deg']:.9f}",
-            f"{row['theta2_deg']:.9f}",
-            f"{row['period_s']:.10f}",
-            f"{row['energy_J']:.9f}",
-            "" if marginal else dpend.stability_class(row["kappa"]),
-            "0" if marginal else f"{row['log_abs_kappa']:.5g}",
-            row["kind"],
-        )
-    _print_table(table)
+    shown = [points[i] | {"kind": ""} for i in chosen] + found["bifurcations"]
+    headings = ("theta1 (deg)", "theta2 (deg)", "period (s)", "energy (J)", "stability")
+    rows = [_family_point(row) for row in sorted(shown, key=lambda row: row["arclength"])]
+    pendulum = Pendulum(*found["pendulum"].values())
+    _print_table(_describe(pendulum), (*headings, "log |kappa|", ""), rows)
     worst = max(point["theta2_error_deg"] for point in points)
     print(
-        f"{len(points)} orbits from {family.ends[0]} to {family.ends[1]}; error of theta2 at most "
-        f"{worst:.0e} deg"
+        "{} orbits from {} to {}; error of theta2 at most {:.0e} deg".format(
+            len(points), *found["ends"], worst
+        )
     )
-    if int(family.status) != Status.CONVERGED:
-        print(f"{record['status']}: {record['message']}")
+    _print_failure(found)
     if out is not None:
         print(f"written to {out}")
 
 
-def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> None:
-    from rich.table import Table
+def _family_point(row: dict[str, Any]) -> tuple[str, ...]:
+    """A row for one of the points, or for a special point, where kappa is what its kind says."""
+    marginal = row["kind"].startswith("stability")
+    logarithm = math.log(max(abs(row["kappa"]), sys.float_info.min))
+    return (
+        f"{row['theta1_deg']:.9f}",
+        f"{row['theta2_deg']:.9f}",
+        f"{row['period_s']:.10f}",
+        f"{row['energy_J']:.9f}",
+        "" if marginal else dpend.stability_class(row["kappa"]),
+        "0" if marginal else f"{row.get('log_abs_kappa', logarithm):.5g}",
+        row["kind"],
+    )
 
-    table = Table(title=_described(atlas.pendulum), title_justify="left", title_style="")
-    headings: tuple[str, ...] = ("family", "periods (s)", "from", "to", "orbits")
-    rows = [_family_row(atlas, one) for one in atlas.families]
-    what = f"{len(atlas.families)} families with {len(atlas)} orbits in the table"
-    if theta1 is not None:
-        headings = (
-            "theta2 (deg)",
-            "period (s)",
-            "symmetry",
-            "stability",
-            "kappa",
-            "dual (deg)",
-            "error (deg)",
-        )
-        rows = [_atlas_row(orbit) for orbit in atlas.orbits]
+
+def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> None:
+    title = _describe(atlas.pendulum)
+    if theta1 is None:
+        families = [_family_row(atlas, one) for one in atlas.families]
+        _print_table(title, ("family", "periods (s)", "from", "to", "orbits"), families)
+        what = f"{len(atlas.families)} families with {len(atlas)} orbits in the table"
+    else:
+        headings = ("theta2 (deg)", "period (s)", "symmetry", "stability", "kappa", "dual (deg)")
+        orbits = [_atlas_row(orbit_record(orbit)) for orbit in atlas.orbits]
+        _print_table(title, (*headings, "error (deg)"), orbits)
         what = f"{len(atlas)} orbits with theta1 = {theta1:g} deg"
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in _WORDS else "right")
-    for row in rows:
-        table.add_row(*row)
-    _print_table(table)
     seen = atlas.coverage
-    print(f"{what} and periods of at most {atlas.max_period:g} s", end="; ")
     print(
+        f"{what} and periods of at most {atlas.max_period:g} s; "
         f"{seen.slices} slice{'s' * (seen.slices > 1)}, {seen.theta2_points} motions, "
         f"{seen.time_points} times"
     )
-    agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
     if seen.exhausted:
         print(
             "STOPPED at the most time steps allowed: more is likely to be missing; raise "
             "--most-steps"
         )
+    agree = "agree" if seen.degree == seen.winding else "DISAGREE: a return is missing"
     print(
         f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding "
         f"number {agree}"
@@ -338,44 +222,36 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
         print(f"written to {out}")
 
 
-_WORDS = ("symmetry", "stability", "family", "from", "to")
+def _atlas_row(row: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        f"{row['theta2_deg']:.9f}",
+        f"{row['period_s']:.9f}",
+        row["symmetry"],
+        row["stability"],
+        f"{row['kappa']:.6g}",
+        "{theta1_deg:.4f}, {theta2_deg:.4f}".format(**row["dual"]),
+        f"{row['error_estimate']['theta2_deg']:.0e}",
+    )
 
 
-def _atlas_row(orbit: PeriodicOrbit) -> list[str]:
-    dual = f"{_degrees(orbit.dual.theta1):.4f}, {_degrees(orbit.dual.theta2):.4f}"
-    return [
-        f"{_degrees(orbit.theta2):.9f}",
-        f"{float(orbit.period):.9f}",
-        orbit.symmetry,
-        orbit.stability,
-        f"{float(orbit.kappa):.6g}",
-        dual,
-        f"{_degrees(orbit.error_estimate[0]):.0e}",
-    ]
+def _family_row(atlas: dpend.Atlas, family: dict[str, Any]) -> tuple[str, ...]:
+    count = int(np.sum(atlas.table["family"] == family["family"]))
+    periods = f"{family['shortest_period_s']:.6f} - {family['longest_period_s']:.6f}"
+    return (family["family"], periods, *family["ends"], str(count))
 
 
-def _family_row(atlas: dpend.Atlas, record: dict[str, Any]) -> list[str]:
-    count = int(np.sum(atlas.table["family"] == record["family"]))
-    periods = f"{record['shortest_period_s']:.6f} - {record['longest_period_s']:.6f}"
-    return [record["family"], periods, *record["ends"], str(count)]
-
-
-def print_fit(record: dict[str, Any], figure: Path | None) -> None:
-    errors = record["standard_errors"]
-    for name, value in record["estimates"].items():
+def print_fit(found: dict[str, Any], figure: Path | None) -> None:
+    errors = found["standard_errors"]
+    for name, value in found["estimates"].items():
         error = errors[name]
-        known = (
-            "held" if error == 0 else "not determined" if error == math.inf else f"+- {error:.2g}"
-        )
+        known = f"+- {error:.2g}"
+        known = {0.0: "held", math.inf: "not determined"}.get(error, known)
         print(f"{name:14}{value:16.{_decimals(error)}f}  {known}")
     print(
-        f"{record['angles']} angles over {record['duration_s']:g} s; noise "
-        f"{record['noise_deg']:.3g} deg",
-        end="",
+        f"{found['angles']} angles over {found['duration_s']:g} s; noise "
+        f"{found['noise_deg']:.3g} deg, of which {found['expected_noise_deg']:.3g} deg was expected"
     )
-    print(f", of which {record['expected_noise_deg']:.3g} deg was expected")
-    if record["status"] != "converged":
-        print(f"{record['status']}: {record['message']}")
+    _print_failure(found)
     if figure is not None:
         print(f"drawn in {figure}")
 
@@ -385,71 +261,61 @@ def _decimals(error: float) -> int:
     return 6 if not 0 < error < math.inf else min(max(1 - math.floor(math.log10(error)), 0), 12)
 
 
-def _described(pendulum: Pendulum) -> str:
-    l1, l2, m1, m2, g = (f"{float(value):g}" for value in jax.tree.leaves(pendulum))
-    bobs = f"l1 = {l1} m, l2 = {l2} m, m1 = {m1} kg, m2 = {m2} kg"
-    return f"{bobs}, g = {g} m/s^2, released from rest"
-
-
-def print_design(
-    found: dpend.Design, record: dict[str, Any], start: Pendulum, theta1: float
-) -> None:
-    from rich.table import Table
-
-    branches = (orbit["branch"] for orbit in record["orbits"])
-    print_orbits(found.pendulum, dict(zip(branches, found.orbits, strict=True)))
-    table = Table(
-        title="derivatives with respect to the logarithms", title_justify="left", title_style=""
-    )
-    table.add_column("")
-    for heading in ("start", "found"):
-        table.add_column(heading, justify="right")
-    for orbit in record["orbits"]:
-        for heading in ("period (s)", "kappa", "theta2 (deg)"):
-            table.add_column(f"{orbit['branch']}\n{heading}", justify="right")
+def print_design(found: dict[str, Any], theta1: float) -> None:
+    orbits = found["orbits"]
+    start, end = (Pendulum(*found[key].values()) for key in ("start", "pendulum"))
+    print_orbits(end, orbits)
     units = {"l1": "m", "l2": "m", "m1": "kg", "m2": "kg", "g": "m/s^2", "theta1": "deg"}
-    angle = record["orbits"][0]["theta1_deg"]
-    values = [*jax.tree.leaves(start), theta1], [*jax.tree.leaves(found.pendulum), angle]
-    for (name, unit), before, after in zip(units.items(), *values, strict=True):
-        slopes = [
-            orbit["sensitivities"][key][name] for orbit in record["orbits"] for key in _SLOPES
-        ]
-        row = [f"{float(before):g}", f"{float(after):.10g}", *(f"{slope:.6g}" for slope in slopes)]
-        table.add_row(f"{name} ({unit})", *row)
-    _print_table(table)
-    missed = ", ".join(f"{name} {value:.0e}" for name, value in record["missed"].items())
+    before = [*jax.tree.leaves(start), theta1]
+    after = [*jax.tree.leaves(end), orbits[0]["theta1_deg"]]
+    rows = []
+    for (name, unit), one, other in zip(units.items(), before, after, strict=True):
+        slopes = [orbit["sensitivities"][key][name] for orbit in orbits for key in _SLOPES]
+        cells = (f"{slope:.6g}" for slope in slopes)
+        rows.append((f"{name} ({unit})", f"{float(one):g}", f"{float(other):.10g}", *cells))
+    headings = [f"{one['branch']}\n{heading}" for one in orbits for *_, heading in _SLOPES.values()]
+    title = "derivatives with respect to the logarithms"
+    _print_table(title, ("", "start", "found", *headings), rows)
+    missed = ", ".join(f"{name} {value:.0e}" for name, value in found["missed"].items())
+    bounds = f"; at bounds: {', '.join(found['at_bounds'])}" if found["at_bounds"] else ""
     print(
-        f"{record['iterations']} steps, {record['looks']} solves; misses {missed}; logarithms "
-        f"changed by",
-        end=" ",
+        f"{found['iterations']} steps, {found['looks']} solves; misses {missed}; logarithms "
+        f"changed by {found['distance']:.6g}{bounds}"
     )
-    print(
-        f"{record['distance']:.6g}"
-        + (f"; at bounds: {', '.join(found.at_bounds)}" if found.at_bounds else "")
-    )
-    if record["status"] != "converged":
-        print(f"{record['status']}: {record['message']}")
+    _print_failure(found)
 
 
-_SLOPES = ("period_s", "kappa", "theta2_deg")
-
-
-def print_motion(record: dict[str, Any], motion: Trajectory, out: Path | None) -> None:
-    final = record["final"]
+def print_motion(found: dict[str, Any], times: int, out: Path | None) -> None:
+    final = found["final"]
     angles = f"theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg"
-    print(f"after {record['duration_s']:g} s   {angles}")
+    print(f"after {found['duration_s']:g} s   {angles}")
     print(f"                p1 = {final['p1']:.12g}, p2 = {final['p2']:.12g} kg m^2/s")
     print(
-        f"error estimate  {record['error_estimate']:.1e} rad, energy drift "
-        f"{record['energy_drift']:.1e} of its scale"
+        f"error estimate  {found['error_estimate']:.1e} rad, energy drift "
+        f"{found['energy_drift']:.1e} of its scale"
     )
-    print(
-        f"integrated by   {record['method']}, {record['steps']} steps of {record['step_s']:.4g} s"
-    )
-    if record["status"] != "converged":
-        print(f"{record['status']}: {record['message']}")
+    print(f"integrated by   {found['method']}, {found['steps']} steps of {found['step_s']:.4g} s")
+    _print_failure(found)
     if out is not None:
-        print(f"written to      {out}: {motion.time.size} times")
+        print(f"written to      {out}: {times} times")
+
+
+def print_map(found: dict[str, Any], figure: Path | None) -> None:
+    print(
+        f"{found['cells']} cells in {found['seconds']:.1f} s, {found['failed']} failed; "
+        f"{found['steps_per_second']:.3g} steps/s of {found['scheme']['method']}, "
+        f"{found['scheme']['step_s']:.4g} s"
+    )
+    print(f"written to {found['out']}" + (f", drawn in {figure}" if figure else ""))
+
+
+def print_films(found: dict[str, Any], releases: Sequence[tuple[float, float]]) -> None:
+    count = len(releases)
+    print(
+        f"{found['frames']} frames of {count} motion{'s' * (count > 1)} written to {found['out']}"
+    )
+    for (one, two), motion in zip(releases, found["motions"], strict=True):
+        _print_failure(motion, f"({one:g}, {two:g}) deg: ")
 
 
 def writer(path: Path) -> Callable[[Trajectory], None]:
@@ -467,23 +333,22 @@ def writer(path: Path) -> Callable[[Trajectory], None]:
 
 
 def _write_csv(motion: Trajectory, path: Path) -> None:
-    state = motion.state
-    columns = (motion.time, np.degrees(state.theta1), np.degrees(state.theta2), state.p1, state.p2)
+    table = columns(motion, "time") | columns(motion.state)
     with path.open("w", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["time_s", "theta1_deg", "theta2_deg", "p1_kg_m2_s", "p2_kg_m2_s"])
-        rows.writerows(zip(*(np.asarray(column).tolist() for column in columns), strict=True))
+        rows.writerow(table)
+        rows.writerows(zip(*table.values(), strict=True))
 
 
-def write_family_csv(record: dict[str, Any], path: Path) -> None:
+def write_family_csv(found: dict[str, Any], path: Path) -> None:
     with path.open("w", newline="") as file:
-        rows = csv.DictWriter(file, record["points"][0])
+        rows = csv.DictWriter(file, found["points"][0])
         rows.writeheader()
-        rows.writerows(record["points"])
+        rows.writerows(found["points"])
 
 
-def write_json(record: dict[str, Any], path: Path) -> None:
-    path.write_text(json_text(record) + "\n")
+def write_json(found: dict[str, Any], path: Path) -> None:
+    path.write_text(json_text(found) + "\n")
 
 
 def _write_netcdf(motion: Trajectory, path: Path) -> None:
@@ -491,34 +356,38 @@ def _write_netcdf(motion: Trajectory, path: Path) -> None:
 
 
 def draw(field: Any, path: Path) -> None:
-    import matplotlib
+    names = [
+        name for name in field.data_vars if name not in ("steps", "status", "bob", "bob_error")
+    ]
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    def picture() -> Any:
+        import matplotlib.pyplot as plt
 
-    from dpend import plots
+        from dpend import plots
 
-    names = [name for name in field.data_vars if name not in ("steps", "status", "bob")]
-    names = [name for name in names if name != "bob_error"]
-    fig, axes = plt.subplots(
-        1, len(names), figsize=(5.6 * len(names), 4.6), layout="constrained", squeeze=False
-    )
-    for name, ax in zip(names, axes[0], strict=True):
-        plots.map_of(field, name, ax)
-    with replacing(path) as draft:
-        fig.savefig(draft, dpi=200)
-    plt.close(fig)
+        size = (5.6 * len(names), 4.6)
+        fig, axes = plt.subplots(1, len(names), figsize=size, layout="constrained", squeeze=False)
+        for name, ax in zip(names, axes[0], strict=True):
+            plots.map_of(field, name, ax)
+        return fig
+
+    _save_figure(picture, path, dpi=200)
 
 
 def draw_fit(fit: dpend.Fit, path: Path) -> None:
+    from dpend import plots
+
+    _save_figure(lambda: plots.residuals(fit), path, dpi=150)
+
+
+def _save_figure(picture: Callable[[], Any], path: Path, dpi: int) -> None:
+    """Draws without a window, whatever the machine has."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from dpend import plots
-
-    fig = plots.residuals(fit)
+    fig = picture()
     with replacing(path) as draft:
-        fig.savefig(draft, dpi=150)
+        fig.savefig(draft, dpi=dpi)
     plt.close(fig)

@@ -13,7 +13,7 @@ from typer.main import get_command
 
 import dpend.catalogue.atlas
 import dpend.catalogue.scan
-from dpend import cli, report
+from dpend import cli, report, terminal
 
 
 @pytest.fixture(autouse=True)
@@ -183,7 +183,7 @@ def test_bad_maps_are_refused_in_one_line(capsys, tmp_path, change, text):
 
 def test_a_damaged_map_is_mended_and_a_long_one_told(capsys, tmp_path, monkeypatch):
     """One line each on standard error; the result is what it was."""
-    monkeypatch.setattr(cli, "_LONG", 0.0)
+    monkeypatch.setattr(terminal, "_LONG", 0.0)
     command = ("map", "flip", "--size", "8", "--duration", "1", "--out", tmp_path / "m.zarr")
     status, _, err = run(capsys, *command)
     assert (status, err.count("\n")) == (0, 1)
@@ -193,7 +193,7 @@ def test_a_damaged_map_is_mended_and_a_long_one_told(capsys, tmp_path, monkeypat
     chunk = tmp_path / "m.zarr" / "flip_time" / "c" / "0" / "0"
     right = chunk.read_bytes()
     chunk.write_bytes(right[:-1])
-    monkeypatch.setattr(cli, "_LONG", 60.0)
+    monkeypatch.setattr(terminal, "_LONG", 60.0)
     status, _, err = run(capsys, *command)
     assert (status, chunk.read_bytes()) == (0, right)
     assert err == (

@@ -27,13 +27,13 @@ catalogue.bicubic catalogue.scan catalogue.files catalogue.atlas catalogue.track
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.fit inverse.nearest
 inverse.design
 dpend
-plots animate report cli
+plots animate options terminal report cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
 LAZY = {("dpend", "plots"), ("dpend", "animate")}
-# The command line prints, with the help of `report`.
-PRINTING = ["cli", "report"]
+# The command line prints results and, on standard error, what it does.
+PRINTING = ["report", "terminal"]
 
 
 def name_of(path: Path) -> str:

@@ -40,7 +40,7 @@ from dpend.inverse.nearest import (
 from dpend.mechanics.pendulum import Pendulum, check_pendulum
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
-from dpend.status import Status, message
+from dpend.status import message
 
 GOALS = ("zero", "minimum")
 
@@ -92,23 +92,7 @@ class Design:
     @property
     def message(self) -> str:
         """The sentence that says what its status means."""
-        return _MESSAGES.get(Status(int(self.status)), message(self.status))
-
-
-_MESSAGES = {
-    Status.CONVERGED: "Found.",
-    Status.MAX_ITERATIONS: "The search did not converge in the allowed iterations, or stalled: "
-    "start from the pendulum "
-    "it came to.",
-    Status.LEFT_BRANCH: "The search was stopped where the branch cannot be followed to this "
-    "release: change the start, "
-    "or the bounds.",
-    Status.NO_SUCH_ORBIT: "The search was stopped where the branch ends without reaching this "
-    "release: change the "
-    "start, or the bounds.",
-    Status.NO_SOLUTION: "No solution was found within the bounds: the least sum of squares near "
-    "the start is returned.",
-}
+        return message(self.status)
 
 
 def design_pendulum(

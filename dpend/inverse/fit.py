@@ -15,7 +15,7 @@ held.
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,7 @@ from dpend.mechanics.pendulum import (
     momenta,
     normal_modes,
 )
+from dpend.records import units_of
 from dpend.status import Status
 
 # How a free field moves the logarithms of l2/l1, m2/m1 and g/l1.
@@ -154,6 +155,11 @@ def _status(
     return Status.MISFIT if not noisy else Status.CONVERGED if determined else Status.SINGULAR
 
 
+# The units of what is estimated.
+_ESTIMATED = units_of(Pendulum) | units_of(State)
+_ESTIMATED |= {"l2/l1": "", "m2/m1": "", "g/l1": "1/s^2", "omega1": "rad/s", "omega2": "rad/s"}
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Fit:
@@ -187,16 +193,16 @@ class Fit:
 
     pendulum: Pendulum
     state: State
-    estimates: dict[str, Scalar]
-    standard_errors: dict[str, Scalar]
+    estimates: Annotated[dict[str, Scalar], _ESTIMATED]
+    standard_errors: Annotated[dict[str, Scalar], _ESTIMATED]
     covariance: Scalar
     time: Scalar
     theta1: Scalar
     theta2: Scalar
     residual1: Scalar
     residual2: Scalar
-    noise: Scalar
-    expected_noise: Scalar
+    noise: Annotated[Scalar, "rad"]
+    expected_noise: Annotated[Scalar, "rad"]
     gap: Scalar
     windows: Scalar
     iterations: Scalar

@@ -13,7 +13,7 @@ what is no `Pendulum` or no `State` raises a ValueError. SI units throughout.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from dpend.checks import (
     single,
 )
 from dpend.mechanics.trig import sincos
+from dpend.records import units_of
 
 Tree = TypeVar("Tree")
 
@@ -81,19 +82,17 @@ class Pendulum:
         RuntimeError: float64 is switched off in JAX.
     """
 
-    l1: Scalar = 0.2
-    l2: Scalar = 0.2
-    m1: Scalar = 0.1
-    m2: Scalar = 0.1
-    g: Scalar = 9.8
+    l1: Annotated[Scalar, "m"] = 0.2
+    l2: Annotated[Scalar, "m"] = 0.2
+    m1: Annotated[Scalar, "kg"] = 0.1
+    m2: Annotated[Scalar, "kg"] = 0.1
+    g: Annotated[Scalar, "m/s^2"] = 9.8
 
     def __post_init__(self) -> None:
         require_float64()
-        for name, unit in (("l1", "m"), ("l2", "m"), ("m1", "kg"), ("m2", "kg")):
-            object.__setattr__(
-                self, name, number(name, getattr(self, name), positive=True, unit=unit)
-            )
-        object.__setattr__(self, "g", number("g", self.g, unit="m/s^2"))
+        for name, of in units_of(type(self)).items():
+            value = number(name, getattr(self, name), positive=name != "g", unit=of)
+            object.__setattr__(self, name, value)
         one_shape(**vars(self))
 
 
@@ -110,19 +109,14 @@ class State:
             single number that JAX has computed, may hold NaN: a motion that was lost.
     """
 
-    theta1: Scalar
-    theta2: Scalar
-    p1: Scalar
-    p2: Scalar
+    theta1: Annotated[Scalar, "rad"]
+    theta2: Annotated[Scalar, "rad"]
+    p1: Annotated[Scalar, "kg m^2/s"]
+    p2: Annotated[Scalar, "kg m^2/s"]
 
     def __post_init__(self) -> None:
-        for name, unit in (
-            ("theta1", "rad"),
-            ("theta2", "rad"),
-            ("p1", "kg m^2/s"),
-            ("p2", "kg m^2/s"),
-        ):
-            object.__setattr__(self, name, coordinate(name, getattr(self, name), unit=unit))
+        for name, of in units_of(type(self)).items():
+            object.__setattr__(self, name, coordinate(name, getattr(self, name), unit=of))
         one_shape(**vars(self))
 
 

@@ -29,7 +29,7 @@ from dpend.mechanics.pendulum import Pendulum, State, check_motion
 from dpend.mechanics.units import Norm, norm
 from dpend.methods.scheme import Scheme, check_scheme
 from dpend.motion.integrate import march, step_size
-from dpend.status import Status
+from dpend.status import Status, message
 
 # The largest step of the differences, in units of the parameter: four extrapolations from there
 # make a smooth loss exact.
@@ -105,19 +105,7 @@ class GradientCheck:
     @property
     def message(self) -> str:
         """The sentence that says what its status means."""
-        return _MESSAGES[Status(int(self.status))]
-
-
-_MESSAGES = {
-    Status.CONVERGED: "The derivatives agree with the differences.",
-    Status.DISAGREEMENT: "The derivatives differ from the differences by more than the tolerance "
-    "and the differences' "
-    "errors: they are wrong, or the loss is not smooth or chaotic here.",
-    Status.BEYOND_HORIZON: "The differences cannot tell to this tolerance, or the motion is longer "
-    "than derivatives "
-    "can be believed: shorten it, or raise the tolerance.",
-    Status.NONFINITE: "A derivative is not finite.",
-}
+        return message(self.status)
 
 
 def check_gradient(

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,7 @@ from dpend.motion.integrate import (
     with_turns,
     without_turns,
 )
+from dpend.records import variables
 from dpend.status import Status, message
 
 # Steps of a motion, if nobody asks for more: half a minute at order 8 with the second pass and all
@@ -80,7 +81,7 @@ class Trajectory:
         tolerance: the error that was asked for [rad]; NaN where a step was given.
     """
 
-    time: Scalar
+    time: Annotated[Scalar, "s"]
     state: State
     energy_drift: Scalar
     error_estimate: Scalar
@@ -123,19 +124,7 @@ class Trajectory:
         """
         import xarray
 
-        units = {"theta1": "rad", "theta2": "rad", "p1": "kg m^2/s", "p2": "kg m^2/s"}
-        data = {
-            name: ("time", np.asarray(getattr(self.state, name)), {"units": unit})
-            for name, unit in units.items()
-        }
-        degrees = {
-            f"{name}_deg": (
-                "time",
-                np.degrees(np.asarray(getattr(self.state, name))),
-                {"units": "degree"},
-            )
-            for name in ("theta1", "theta2")
-        }
+        data, degrees = variables(self.state, "time")
         attributes = {
             "energy_drift": float(self.energy_drift),
             "error_estimate_rad": float(self.error_estimate),

@@ -45,7 +45,7 @@ from dpend.orbits.orbit import BRANCHES, PeriodicOrbit, Slopes, mirrored, orbits
 from dpend.orbits.samples import SpecialPoint
 from dpend.orbits.special import special_points
 from dpend.orbits.walk import FIRST_STEP, beginning
-from dpend.status import Status
+from dpend.status import Status, message
 
 # The longest step: a hundred points or so for a family, close enough for cubics to show every turn.
 _LONGEST_STEP = 0.1
@@ -91,7 +91,7 @@ class Family:
     @property
     def message(self) -> str:
         """The sentence that says what its status means."""
-        return _MESSAGES[Status(int(self.status))]
+        return message(self.status)
 
     def at(self, theta1: Scalar, *, crossing: int | Any = 1) -> PeriodicOrbit:
         """The orbits of this family released at `theta1`: Newton's method from where its curve
@@ -116,14 +116,6 @@ class Family:
         """
         return _at(self, theta1, crossing)
 
-
-_MESSAGES = {
-    Status.CONVERGED: "Followed from end to end.",
-    Status.LEFT_BRANCH: "At one end no step was short enough to stay on this curve: its orbits are "
-    "as they are, but it "
-    "goes on.",
-    Status.MAX_ITERATIONS: "It has more points than were allowed: raise most_points.",
-}
 
 # The derivative with respect to theta1 is refused where less than this share of a step along the
 # curve goes into it, which is nearer to the fold than its square.

@@ -5,7 +5,7 @@ function theorem.
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -57,15 +57,15 @@ class PeriodicOrbit:
 
     pendulum: Pendulum
     state: State
-    period: Scalar
-    energy: Scalar
+    period: Annotated[Scalar, "s"]
+    energy: Annotated[Scalar, "J"]
     residual: Scalar
     iterations: Scalar
     kappa: Scalar
     log_abs_kappa: Scalar
     dual: State
     turns: tuple[Scalar, Scalar]
-    error_estimate: tuple[Scalar, Scalar]
+    error_estimate: Annotated[tuple[Scalar, Scalar], {"theta2": "rad", "period": "s"}]
     status: Scalar
     symmetry: str = field(metadata={"static": True})
 

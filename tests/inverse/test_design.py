@@ -325,7 +325,7 @@ def test_failures_are_statuses(paper):
     assert poisoned.status == Status.NONFINITE
     beyond = dpend.design_pendulum(one_second, paper, "g", branch="in-phase", theta1=3.14159)
     assert beyond.status == Status.NO_SUCH_ORBIT
-    assert "where the branch ends" in beyond.message
+    assert "The branch ends" in beyond.message
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,238 @@
+"""The options of the command line: their types, those that all share, and what their texts mean."""
+
+import functools
+import inspect
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from dpend.checks import number
+from dpend.mechanics.pendulum import Pendulum
+from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
+from dpend.records import parse_decimal
+
+# What a count fits in, here and in the compiled programs.
+_LARGEST_INTEGER = 2**63 - 1
+# Along a map's side: sixteen times what a large map has; beyond it lies a slip of the finger.
+_MOST_CELLS = 65536
+
+
+class _Command(typer.core.TyperCommand):
+    """A command that refuses what no option can mean: one given twice, an empty text, a number that
+    is not finite.
+    """
+
+    # Any: each version of typer has its own class of contexts.
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        for option in self.params:
+            name, times = max(option.opts, key=len), sum(option is one for one in order)
+            if times > 1 and not option.multiple and option.nargs == 1:
+                raise ValueError(
+                    f"{name} must be given once at most, got it {times} times: leave out all but "
+                    f"one"
+                )
+            if "" in _several(given.get(option.name or "")):
+                raise ValueError(
+                    f"{name} must not be empty, got '': give a value, or leave {name} out"
+                )
+        rest = super().parse_args(ctx, args)
+        for option in self.params:
+            unit = re.search(r"( \[[^]]+\]|)[^]]*$", getattr(option, "help", None) or "")
+            for one in _several(ctx.params.get(option.name or "")):
+                if isinstance(one, float) and not math.isfinite(one):
+                    raise ValueError(
+                        f"{option.name} must be a finite number{unit[1] if unit else ''}, got "
+                        f"{one}: "
+                        f"give another {option.name}"
+                    )
+        return rest
+
+
+def _several(value: object) -> Sequence[object]:
+    return value if isinstance(value, (list, tuple)) else (value,)
+
+
+def _number(text: str | float | int) -> float:  # defaults come as what they are
+    if not isinstance(text, str):
+        return float(text)
+    if text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        return float(text)  # the command refuses it by the name of its option
+    try:
+        return parse_decimal(text)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r:.60} is not a number: give one like 40 or 1e-3"
+        ) from None
+
+
+def _integer(text: str | int) -> int:
+    if not isinstance(text, str):
+        return text
+    if not re.fullmatch(r"[+-]?\d+", text, re.ASCII):
+        raise typer.BadParameter(f"{text!r:.60} is not an integer: give one like 1")
+    if len(text) > 20 or abs(int(text)) > _LARGEST_INTEGER:
+        raise typer.BadParameter(f"{text!r:.60} is beyond {_LARGEST_INTEGER}: give a smaller one")
+    return int(text)
+
+
+def numeric(*names: str, help: str) -> Any:
+    return typer.Option(*names, help=help, parser=_number, metavar="NUMBER")
+
+
+def counted(help: str) -> Any:
+    return typer.Option(parser=_integer, metavar="INTEGER", help=help)
+
+
+# The options of every command: a pendulum, and how its result is printed.
+_PENDULUM = {
+    "l1": (0.2, "Length of the upper rod [m]."),
+    "l2": (0.2, "Length of the lower rod [m]."),
+    "m1": (0.1, "Mass of the upper bob [kg]."),
+    "m2": (0.1, "Mass of the lower bob [kg]."),
+    "g": (9.8, "Acceleration of gravity [m/s^2]."),
+}
+_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+
+# What a command hands back: its record for --json, how to print it for people, and whether all its
+# solves succeeded.
+Report = tuple[dict[str, Any], Callable[[], None], bool]
+
+
+def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, kind, default=default, annotation=annotation)
+
+
+_SHARED = [
+    _keyword(name, default, Annotated[float, numeric(f"--{name}", help=text)])
+    for name, (default, text) in _PENDULUM.items()
+]
+_SHARED.append(_keyword("as_json", False, _JSON))
+
+
+def command(
+    app: typer.Typer, print_json: Callable[[dict[str, Any]], None], name: str | None = None
+) -> Callable[[Callable[..., Report]], Callable[..., int]]:
+    """Makes a function of a pendulum and options a command, which takes the shared options too,
+    prints its report, and has an exit status.
+    """
+
+    def decorate(call: Callable[..., Report]) -> Callable[..., int]:
+        @functools.wraps(call)
+        def run(*, as_json: bool, **given: Any) -> int:
+            pendulum = Pendulum(**{key: given.pop(key) for key in _PENDULUM})
+            record, show, solved = call(pendulum, **given)
+            print_json(record) if as_json else show()
+            return 0 if solved else 1
+
+        own = list(inspect.signature(call).parameters.values())[1:]
+        own = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in own]
+        run.__signature__ = inspect.Signature([*own, *_SHARED])  # type: ignore[attr-defined]
+        return app.command(name=name, cls=_Command)(run)
+
+    return decorate
+
+
+def radians(name: str, degrees: float) -> float:
+    return math.radians(number(name, degrees, unit="deg"))
+
+
+def equations_of(
+    branch: str | None, period: float | None, kappa: float | None, ratio: float | None
+) -> tuple[dict[str, Callable[[dict[str, PeriodicOrbit]], Any]], tuple[str, ...]]:
+    """The equations of a design, each a function of the orbits by branch, and the branches whose
+    orbits it takes.
+    """
+    if period is None and kappa is None and ratio is None:
+        raise ValueError(
+            "period, kappa or ratio must be given, got none of them: say what is wanted"
+        )
+    if branch is None and (period is not None or kappa is not None):
+        raise ValueError(
+            f"branch must be given with period and kappa, got none: give {' or '.join(BRANCHES)}"
+        )
+    if branch is not None and branch not in BRANCHES:
+        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    if branch is not None and period is None and kappa is None:
+        raise ValueError(f"branch must go with period or kappa, got {branch!r} with ratio alone, "
+                         f"which is of both: "
+                         "leave it out")  # fmt: skip
+    equations: dict[str, Callable[[dict[str, PeriodicOrbit]], Any]] = {}
+    if period is not None:
+        seconds = float(number("period", period, positive=True, unit="s"))
+        equations["period_s"] = lambda orbits: orbits[str(branch)].period - seconds
+    if kappa is not None:
+        middle = float(number("kappa", kappa))
+        equations["kappa"] = lambda orbits: orbits[str(branch)].kappa - middle
+    if ratio is not None:
+        wanted = float(number("ratio", ratio, positive=True))
+        equations["ratio"] = lambda orbits: (
+            orbits["in-phase"].period / orbits["anti-phase"].period - wanted
+        )
+    return equations, BRANCHES if ratio is not None else (str(branch),)
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    if "" in names:
+        raise ValueError(
+            f"free must be names with commas between them, got {text!r}: give them like l2,m2"
+        )
+    return names
+
+
+def bounds_in(texts: list[str]) -> dict[str, tuple[float, float]]:
+    """Bounds by name, of theta1 in radians."""
+    bounds = {}
+    for text in texts:
+        name, _, span = text.partition("=")
+        try:
+            low, high = (parse_decimal(part) for part in span.split(":"))
+        except ValueError:
+            raise ValueError(
+                f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5"
+            ) from None
+        if name in bounds:
+            raise ValueError(f"bounds must be given once a name, got {name} twice: leave one out")
+        bounds[name] = (math.radians(low), math.radians(high)) if name == "theta1" else (low, high)
+    return bounds
+
+
+def size_in(text: str) -> tuple[int, int]:
+    sides = text.lower().split("x")
+    if len(sides) > 2 or not all(
+        re.fullmatch(r"[0-9]{1,99}", side) and int(side) for side in sides
+    ):
+        raise ValueError(
+            f"size must be N or NxM with whole numbers above zero, got {text!r}: give one like "
+            f"512x256"
+        )
+    cells = int(sides[0]), int(sides[-1])
+    if max(cells) > _MOST_CELLS:
+        raise ValueError(
+            f"size must be at most {_MOST_CELLS} along a side, got {text!r}: map a smaller range"
+        )
+    return cells
+
+
+def cells_in(name: str, text: str, count: int) -> np.ndarray:
+    """The centres [rad] of `count` cells of a range A:B [deg]; a symmetric range is one half and
+    its mirror image.
+    """
+    try:
+        start, end = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise ValueError(
+            f"{name} must be a range A:B in degrees, got {text!r}: give one like -180:180"
+        ) from None
+    if not (math.isfinite(start) and math.isfinite(end) and start < end):
+        raise ValueError(
+            f"{name} must be a range A:B with A below B, got {text!r}: give one like -180:180"
+        )
+    centres = np.radians(start + (np.arange(count) + 0.5) * ((end - start) / count))
+    return 0.5 * (centres - centres[::-1]) if start == -end else centres
