@@ -649,7 +649,7 @@ DOORS = {
                 none=True,
             ),
         },
-        "dpend.inverse.nearest.find_orbit",
+        "dpend.inverse.problem.find_orbit",
     ),
     "fit_parameters": Door(
         dpend.fit_parameters,
