@@ -705,7 +705,7 @@ DOORS = {
             ),
             "noise": MAYBE_POSITIVE,
         },
-        "dpend.inverse.fit._fitted",
+        "dpend.inverse.fit._fit",
     ),
     "check_gradient": Door(
         dpend.check_gradient,

@@ -164,7 +164,7 @@ def design_pendulum(
             "outside of it"
         )
     start = swinging_pendulum(pendulum)
-    branches, angles = _orbits_asked(branch, theta1)
+    branches, angles = _read_orbits(branch, theta1)
     names = _names(free)
     if "theta1" in names and not np.isscalar(theta1) and len(angles) > 1:
         raise ValueError(
@@ -194,7 +194,7 @@ def design_pendulum(
     return _result(problem, *solve(problem, first, max_iterations))
 
 
-def _orbits_asked(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
+def _read_orbits(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
     """Branches and angles, one each for every orbit."""
     branches = (branch,) if isinstance(branch, str) else branch
     if not isinstance(branches, Sequence) or not branches:
