@@ -50,7 +50,7 @@ class _Stop(Exception):
 class _Route:
     """What SLSQP asks for: the equations and their derivatives; each place is solved for once."""
 
-    def __init__(self, problem: DesignProblem, start: Look):
+    def __init__(self, problem: DesignProblem, start: Look) -> None:
         self.problem, self.free, self.here, self.latest = problem, problem.free, start, start
         self.steps, self.failure = 0, int(Status.NO_SOLUTION)
         self.steep = np.full(start.value.shape, _STEEP * max(1.0, np.max(np.abs(start.value))))
