@@ -648,7 +648,7 @@ DOORS = {
                 none=True,
             ),
         },
-        "dpend.inverse.nearest.find_orbit",
+        "dpend.inverse.problem.find_orbit",
     ),
     "fit_parameters": Door(
         dpend.fit_parameters,
@@ -704,7 +704,7 @@ DOORS = {
             ),
             "noise": MAYBE_POSITIVE,
         },
-        "dpend.inverse.fit._fitted",
+        "dpend.inverse.fit._fit",
     ),
     "check_gradient": Door(
         dpend.check_gradient,

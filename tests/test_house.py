@@ -23,9 +23,10 @@ chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
 orbits.stability orbits.arc orbits.newton orbits.single orbits.walk orbits.curve orbits.follow
 orbits.orbit orbits.samples orbits.crossings orbits.special orbits.find orbits.family
-catalogue.bicubic catalogue.scan catalogue.files catalogue.atlas catalogue.track catalogue.survey
-inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.fit inverse.nearest
-inverse.design
+catalogue.bicubic catalogue.rows catalogue.scan catalogue.files catalogue.atlas catalogue.track
+catalogue.progress catalogue.entries catalogue.survey
+inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
+inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
 plots animate options terminal report cli
 """.split()

@@ -1,18 +1,20 @@
-"""Cells of a rectangle with their bicubics: which are empty, which hold one zero, which are to be
-halved.
-"""
+"""Cells of a rectangle with their bicubics: empty ones, ones with one zero, and ones to halve."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-# The error counts that far about a row, nearly a radian of the fast mode.
+# An error counts for this many rows on either side, nearly a radian of the fast mode.
 _NEARBY = 16
-# A cell that is bent in time more than in theta2, as near a fold, is halved in time, so often at
-# most.
+# A cell that is bent in time more than in theta2, as near a fold, is halved in time: at most so
+# often.
 SPLITS = 12
-# How far from the unit matrix a derivative may be.
+# A cell is simple if its derivative, preconditioned, is nearer than this to the unit matrix.
 _DOMINANCE = 0.9
+# Newton's iterations for the zero of a simple cell.
+_NEWTON = 12
+# Chords along a cell's last edge. A zero between an edge and its chords would be on the wrong side.
+_CHORDS = 32
 
 
 class Intervals(NamedTuple):
@@ -62,6 +64,18 @@ def bernstein_net(some: Intervals, row: np.ndarray, lane: np.ndarray, dt: float)
     return net
 
 
+def error_in_time(some: Intervals, row: np.ndarray, lane: np.ndarray, dt: float) -> np.ndarray:
+    """What the cubics along time miss, from every other row."""
+    missed = np.zeros(row.size)
+    for middle in (row, row + 1):
+        middle = np.clip(middle, 1, some.at_left.shape[2] - 2)
+        for end in (some.at_left, some.at_right):
+            before, here, after = (end[:2, :, middle + k, lane] for k in (-1, 0, 1))
+            foretold = 0.5 * (before[0] + after[0]) + dt / 4 * (before[1] - after[1])
+            missed = np.maximum(missed, np.max(np.abs(foretold - here[0]), axis=0))
+    return missed / 16
+
+
 class Cells(NamedTuple):
     """Bicubics over cells, or over parts of cells that were halved in time.
 
@@ -77,7 +91,8 @@ class Cells(NamedTuple):
     whole: np.ndarray
     start: np.ndarray
 
-    def told(self) -> "_Told":
+    def classify(self) -> "_Kinds":
+        """Which parts are empty, which simple with a zero where, and which open."""
         by_angle, by_time = (
             3 * (self.net[1:] - self.net[:-1]),
             3 * (self.net[:, 1:] - self.net[:, :-1]),
@@ -106,8 +121,8 @@ class Cells(NamedTuple):
         # A cubic's slope is wrong by up to four times its value's error, at either end.
         near = apart + 8 * np.max(error[:, left], axis=0) < _DOMINANCE
         simple = left[near]
-        return _Told(
-            left[~near], simple, _zero_of(value[..., simple]), np.sign(determinant[simple])
+        return _Kinds(
+            left[~near], simple, _find_zero(value[..., simple]), np.sign(determinant[simple])
         )
 
     def bent_in_time(self, which: np.ndarray) -> np.ndarray:
@@ -117,7 +132,7 @@ class Cells(NamedTuple):
         across, along = bent
         return np.asarray(along > across)
 
-    def halved(self, which: np.ndarray, split: int) -> "Cells":
+    def halve(self, which: np.ndarray, split: int) -> "Cells":
         """Both halves in time, by de Casteljau's construction, of parts halved `split` times
         before.
         """
@@ -135,9 +150,9 @@ class Cells(NamedTuple):
         )
 
 
-class _Told(NamedTuple):
-    """Which parts are open, being neither empty nor simple, and which simple; where these have
-    their zero, in units of their sides, and its sign.
+class _Kinds(NamedTuple):
+    """Which parts are open, neither empty nor simple, and which are simple; where these have their
+    zero, in units of their sides, and its sign.
     """
 
     open: np.ndarray
@@ -151,7 +166,7 @@ def _product(matrix: np.ndarray, net: np.ndarray) -> np.ndarray:
     return np.stack([row[0] * net[:, :, 0] + row[1] * net[:, :, 1] for row in matrix], axis=2)
 
 
-def _zero_of(net: np.ndarray) -> np.ndarray:
+def _find_zero(net: np.ndarray) -> np.ndarray:
     """Newton's method for the zero of bicubics that are near the identity plus a shift, shape (2,
     cells).
     """
@@ -166,9 +181,6 @@ def _zero_of(net: np.ndarray) -> np.ndarray:
         x[1] -= (across[0] * value[1] - across[1] * value[0]) / determinant
         np.clip(x, -1.0, 2.0, out=x)
     return x
-
-
-_NEWTON = 12
 
 
 def _bernstein(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +201,3 @@ def turn_along(some: Intervals) -> float:
     along = np.einsum("ik,icn->kcn", weights, net)
     (x0, y0), (x1, y1) = np.moveaxis(along[:-1], 1, 0), np.moveaxis(along[1:], 1, 0)
     return -float(np.sum(np.arctan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)))
-
-
-# Chords of a cell's last edge, past which a zero could lie on the wrong side.
-_CHORDS = 32

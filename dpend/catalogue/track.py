@@ -9,17 +9,21 @@ import numpy as np
 from dpend.orbits.curve import away_from, way_to
 from dpend.orbits.family import Family
 
-# Points along families lie no further apart than this [arclength], so that chords between them are
-# true to the second [rad, and log of the period], or to the third of their length where releases
-# run faster than arclength: what is nearer to a chord belongs to its family.
-STEP, NEAR, _BENT = 0.02, 3e-3, 0.05
-# What following a family takes in time steps of a motion, point by point, and holding a return
-# against its chords: for all of them, and one more for so many each.
-STEPS_PER_POINT, _STEPS_TO_HOLD, _CHORDS_PER_STEP = 2500, 5, 30
-
-# In a slice, where a curve that runs along it makes more of the same error, partners are this
-# close; where it turns back, two passages of one family.
-_PARTNER, _PAIR = 0.03, 0.1
+# Spacing of the points of a family [arclength].
+STEP = 0.02
+# A release this near to a chord belongs to the family [rad, log period].
+NEAR = 3e-3
+# ... or within this share of the chord's length, where the curve bends.
+_BENT = 0.05
+# What a point of a family costs to follow, in time steps of a motion.
+STEPS_PER_POINT = 2500
+# What it costs to hold a return against a family, and one more for so many of its chords.
+_STEPS_TO_HOLD, _CHORDS_PER_STEP = 5, 30
+# In a slice, a return and a passage this near to each other are partners [rad, log period]. A curve
+# that runs along the slice makes more of the error above.
+_PARTNER = 0.03
+# Two passages this near to each other may be one family that turns back there.
+_PAIR = 0.1
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ def _apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(way_to(one[:, None], other), axis=-1))
 
 
-def left_over(returns: np.ndarray, passages: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def partnerless(returns: np.ndarray, passages: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Those of each kind that have no partner, the nearest having been matched first."""
     apart = _apart(returns, passages)
     free = np.ones(len(returns), bool), np.ones(len(passages), bool)

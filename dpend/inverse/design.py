@@ -28,15 +28,8 @@ import numpy as np
 
 from dpend._runtime import require_float64
 from dpend.checks import Scalar, function, integer, is_traced, known_number, one_of, several, shown
-from dpend.inverse.nearest import (
-    PARAMETERS,
-    Look,
-    Problem,
-    least_on_bounds,
-    loss_itself,
-    nearest_of_many,
-    nearest_of_one,
-)
+from dpend.inverse.nearest import least_on_bounds, loss_itself, nearest_of_many, nearest_of_one
+from dpend.inverse.problem import PARAMETERS, DesignProblem, Look
 from dpend.mechanics.pendulum import Pendulum, check_pendulum
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
@@ -155,7 +148,7 @@ def design_pendulum(
             "outside of it"
         )
     start = swinging_pendulum(pendulum)
-    branches, angles = _orbits_asked(branch, theta1)
+    branches, angles = _read_orbits(branch, theta1)
     names = _names(free)
     if "theta1" in names and not np.isscalar(theta1) and len(angles) > 1:
         raise ValueError(
@@ -164,7 +157,7 @@ def design_pendulum(
     goal, max_iterations = one_of("goal", goal, GOALS), integer("max_iterations", max_iterations)
     values = dict(zip(PARAMETERS, [*jax.tree.leaves(start), angles[0]], strict=True))
     low, high = _box(values, names, bounds)
-    problem = Problem(loss, start, branches, angles, low, high)
+    problem = DesignProblem(loss, start, branches, angles, low, high)
     first = problem.at(np.zeros(len(PARAMETERS)))
     equations = first.value.size
     if goal == "minimum" and equations != 1:
@@ -185,7 +178,7 @@ def design_pendulum(
     return _result(problem, *solve(problem, first, max_iterations))
 
 
-def _orbits_asked(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
+def _read_orbits(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
     """Branches and angles, one each for every orbit."""
     branches = (branch,) if isinstance(branch, str) else branch
     if not isinstance(branches, Sequence) or not branches:
@@ -264,7 +257,7 @@ def _box(
     return low, high
 
 
-def _result(problem: Problem, look: Look, steps: int, status: int) -> Design:
+def _result(problem: DesignProblem, look: Look, steps: int, status: int) -> Design:
     parameters = [
         np.array([*jax.tree.leaves(orbit.pendulum), orbit.theta1]) for orbit in look.orbits
     ]

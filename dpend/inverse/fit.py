@@ -23,25 +23,30 @@ import numpy as np
 
 from dpend._runtime import require_float64
 from dpend.checks import Scalar, known_number, several, shown
-from dpend.inverse.gauss_newton import ROUNDED, Found, refined, solved
-from dpend.inverse.measurements import FEWEST, Angles, checked, wrapped
-from dpend.inverse.search import FIRST, MOSTLY, all_at_once, smoothed, window_by_window
+from dpend.inverse.gauss_newton import Found, close_joints, refine
+from dpend.inverse.measurements import FEWEST, Angles, check_angles, wrap
+from dpend.inverse.search import FIRST, MOSTLY, all_at_once, smooth_start, window_by_window
+from dpend.inverse.uncertainty import (
+    LEAST_NOISE,
+    Uncertainty,
+    find_uncertainty,
+    fit_status,
+    is_noise,
+)
 from dpend.inverse.windows import (
-    MOST_TURN,
-    Point,
-    Problem,
     Settings,
-    fitted_angles,
-    laid_out,
+    WindowedData,
+    angles_at_samples,
+    check_fast_mode,
+    lay_windows,
     settings_for,
+    time_rate,
 )
 from dpend.mechanics.pendulum import (
     Pendulum,
     State,
-    fast_frequency,
     known_pendulum,
     momenta,
-    normal_modes,
 )
 from dpend.records import units_of
 from dpend.status import Status
@@ -50,109 +55,8 @@ from dpend.status import Status
 _BY_FIELD = {"l1": (-1, 0, -1), "l2": (1, 0, 0), "m1": (0, -1, 0), "m2": (0, 1, 0), "g": (0, 0, 1)}
 RATIOS = ("l2/l1", "m2/m1", "g/l1")
 INITIAL = ("theta1", "theta2", "omega1", "omega2")
-
-# The fitted misses may be this many times what was expected, and as much more as chance makes of
-# few; neighbouring ones may be correlated so much; below so many radians they are what integration
-# and rounding leave.
-_MORE_THAN_NOISE, _CORRELATED, _NO_NOISE = 1.5, 0.5, 1e-6
-
-
-class _Knowledge(NamedTuple):
-    covariance: (
-        np.ndarray
-    )  # of the fields' logarithms, then of the first node; infinite where nothing is known
-    ratios: np.ndarray  # (3,), standard errors of the logarithms of the ratios
-    determined: bool
-
-
-def _knowledge(problem: Problem, found: Found, settings: Settings, noise: float) -> _Knowledge:
-    """Covariances at the solution; what depends on an axis of the fields that the data do not
-    determine is infinite.
-    """
-    free, step = problem.by_free.shape[1], found.step
-    if step is None:
-        return _Knowledge(np.full((free + 4, free + 4), np.nan), np.full(3, np.nan), False)
-    weights, axes = np.linalg.eigh(step.information)
-    known = weights > max(settings.noise**2, ROUNDED * float(np.max(np.abs(weights), initial=0.0)))
-    errors = np.where(known, noise / np.sqrt(np.where(known, weights, 1.0)), np.inf)
-    loose = settings.rate * (problem.times[-1] - problem.times[0]) * errors > _PHASE
-    for j in np.flatnonzero(known & loose).tolist():
-        known[j] = _is_bounded(
-            problem, found, settings, noise, min(_FAR_OFF * float(errors[j]), 1.0), axes, j
-        )
-    inverse = (axes[:, known] / weights[known]) @ axes[:, known].T
-    moves = np.vstack([np.eye(free), step.response[:, :, 0].T])
-    covariance = moves @ inverse @ moves.T
-    covariance[free:, free:] += step.alone
-    covariance *= noise**2
-    deviations = np.sqrt(np.diag(covariance))
-    unknown = np.any(np.abs(moves @ axes[:, ~known]) > deviations[:, None], axis=1)
-    unknown[free : free + 2] |= deviations[free : free + 2] > 1.0
-    covariance[unknown], covariance[:, unknown] = np.nan, np.nan
-    covariance[unknown, unknown] = np.inf
-    ratios = np.sqrt(np.diag(problem.by_free @ inverse @ problem.by_free.T)) * noise
-    lost = np.any(np.abs(problem.by_free @ axes[:, ~known]) > ratios[:, None], axis=1)
-    return _Knowledge(covariance, np.where(lost, np.inf, ratios), not np.any(unknown))
-
-
-# A mode that is not excited is fitted to the noise, and its frequency comes out with a small formal
-# error: a phase of more than this [rad] over the data is worth a look. There, the sum of squares
-# this many standard errors away, at most a factor of e, must have grown by so many variances of the
-# noise; no frequency in pure noise stands out by as much.
-_PHASE, _FAR_OFF, _GROWN = 0.3, 10.0, 30.0
-
-
-def _is_bounded(
-    problem: Problem,
-    found: Found,
-    settings: Settings,
-    noise: float,
-    far: float,
-    axes: np.ndarray,
-    j: int,
-) -> bool:
-    """Whether the sum of squares has grown much `far` along an axis, to either side, where all else
-    is fitted again.
-    """
-    assert found.step is not None
-    others = np.delete(axes, j, axis=1)
-    for way in (far * axes[:, j], -far * axes[:, j]):
-        shifted = problem._replace(
-            logs=problem.logs + problem.by_free @ (found.point.fields + way),
-            by_free=problem.by_free @ others,
-        )
-        nodes = found.point.nodes + np.tensordot(way, found.step.response, 1)
-        aside = solved(shifted, Point(nodes, np.zeros(others.shape[1])), settings)
-        grown = (aside.misses.squares - found.misses.squares) / max(noise, _LEAST_NOISE) ** 2
-        if aside.step is not None and grown < _GROWN:
-            return False
-    return True
-
-
-def _is_noise(residuals: np.ndarray, noise: float, expected: float, freedom: int) -> bool:
-    """Whether what is left of the data is as large as was expected, and not the same from sample to
-    sample.
-    """
-    if noise < _NO_NOISE:
-        return True
-    if noise > expected * (_MORE_THAN_NOISE + 3 / math.sqrt(freedom)):
-        return False
-    pairs = residuals[:, 1:] * residuals[:, :-1]
-    there = np.isfinite(pairs)
-    count = int(np.sum(there))
-    return float(np.sum(pairs[there])) <= (_CORRELATED * count + 3 * math.sqrt(count)) * noise**2
-
-
-def _status(
-    problem: Problem, found: Found, determined: bool, noisy: bool, expected: float
-) -> Status:
-    """The verdict; also what keeps the iteration from closing the joints is a misfit where it was
-    one before.
-    """
-    if found.status != Status.CONVERGED:
-        far = found.misses.squares > problem.observations * (_MORE_THAN_NOISE * expected) ** 2
-        return Status.MISFIT if far and found.status == Status.MAX_ITERATIONS else found.status
-    return Status.MISFIT if not noisy else Status.CONVERGED if determined else Status.SINGULAR
+# Of two lengths or masses: beyond this ratio rounding hides what the lighter or shorter one does.
+_MOST_UNEQUAL = 1e9
 
 
 # The units of what is estimated.
@@ -255,16 +159,16 @@ def fit_parameters(
     """
     require_float64()
     numbers = known_pendulum(Pendulum() if pendulum is None else pendulum)
-    names = _checked_free(free)
+    names = _check_free(free)
     if "g" in names and numbers.g == 0:
         raise ValueError(
             "g must not start at 0 where it is free, got 0: give its sign and size by a start "
             "above or below"
         )
-    held = _checked_initial(initial)
-    sigma = None if noise is None else _checked_noise(noise)
+    held = _check_initial(initial)
+    sigma = None if noise is None else _check_noise(noise)
     _check_shape(numbers)
-    series = checked(times, theta1, theta2)
+    series = check_angles(times, theta1, theta2)
     unknowns = len(names) + held.count(None)
     count = int(np.sum(np.isfinite(series.values)))
     if count < unknowns + FEWEST:
@@ -273,10 +177,10 @@ def fit_parameters(
             f"{unknowns + FEWEST}"
         )
     with np.errstate(all="ignore"):  # what overflows is told by the status
-        return _fitted(series, numbers, names, held, sigma)
+        return _fit(series, numbers, names, held, sigma)
 
 
-def _checked_free(free: Any) -> tuple[str, ...]:
+def _check_free(free: Any) -> tuple[str, ...]:
     names = (free,) if isinstance(free, str) or not hasattr(free, "__iter__") else tuple(free)
     for name in names:
         if not isinstance(name, str) or name not in _BY_FIELD or names.count(name) > 1:
@@ -297,18 +201,11 @@ def _checked_free(free: Any) -> tuple[str, ...]:
     return names
 
 
-# Angles of a radian are rounded by this much [rad], and no motion in doubles is known to less.
-_LEAST_NOISE = 1e-15
-# Of two lengths or masses: beyond this ratio what the lighter or shorter does is lost in rounding,
-# or it overflows.
-_MOST_UNEQUAL = 1e9
-
-
-def _checked_noise(noise: Any) -> float:
+def _check_noise(noise: Any) -> float:
     sigma = float(known_number("noise", noise, positive=True, unit="rad"))
-    if not _LEAST_NOISE <= sigma <= math.pi:
+    if not LEAST_NOISE <= sigma <= math.pi:
         raise ValueError(
-            f"noise must be from {_LEAST_NOISE:g} rad, where doubles round, to pi rad, half a "
+            f"noise must be from {LEAST_NOISE:g} rad, where doubles round, to pi rad, half a "
             f"turn, "
             f"got {sigma:.3g} rad ({math.degrees(sigma):.3g} deg): give that of one angle, or none"
         )
@@ -327,7 +224,7 @@ def _check_shape(pendulum: Pendulum) -> None:
             )
 
 
-def _checked_initial(initial: Any) -> tuple[float | None, ...]:
+def _check_initial(initial: Any) -> tuple[float | None, ...]:
     values = several("initial", initial, f"{', '.join(INITIAL)}", len(INITIAL))
     return tuple(
         None if value is None else known_number(f"initial {name}", value)
@@ -335,25 +232,26 @@ def _checked_initial(initial: Any) -> tuple[float | None, ...]:
     )
 
 
-def _fitted(
+def _fit(
     series: Angles,
     pendulum: Pendulum,
     free: tuple[str, ...],
     initial: tuple[float | None, ...],
     sigma: float | None,
 ) -> Fit:
-    rate = _rate(series, pendulum)
+    rate = time_rate(series, pendulum)
     by_free = np.array([_BY_FIELD[name] for name in free], float).reshape(-1, 3).T
-    problem = laid_out(
+    problem = lay_windows(
         series, pendulum, by_free, np.array([value is not None for value in initial]), rate
     )
-    _check_fast_mode(pendulum, float(np.max(problem.dts)))
-    start = smoothed(problem, *series, initial, rate)
-    expected = sigma or max(start.noise, _LEAST_NOISE)
+    check_fast_mode(pendulum, float(np.max(problem.dts)))
+    start = smooth_start(problem, *series, initial, rate)
+    expected = sigma or max(start.noise, LEAST_NOISE)
     seen_at_first = bool(np.all(start.known[:, 0]))
     searches = [(window_by_window, first) for first in (FIRST[:1] if seen_at_first else FIRST)]
     if np.mean(np.all(start.known, axis=0)) > MOSTLY:
         searches.insert(0, (all_at_once, 0))
+    task = _Task(series, pendulum, free, sigma, problem)
     total, fits = 0, []
     for search, first in searches:
         settings = settings_for(
@@ -363,9 +261,9 @@ def _fitted(
         settings = settings_for(
             problem, point.nodes, np.ones_like(start.known), rate, expected, point.fields
         )
-        found, settings, change = refined(problem, solved(problem, point, settings), settings)
+        found, settings, change = refine(problem, close_joints(problem, point, settings), settings)
         total += count + found.iterations
-        fits.append(_result(series, pendulum, free, problem, found, settings, sigma, change, total))
+        fits.append(_result(task, found, settings, change, total))
         if found.step is not None and fits[-1].status in (Status.CONVERGED, Status.SINGULAR):
             return fits[-1]
     return min(
@@ -373,109 +271,45 @@ def _fitted(
     )
 
 
-def _rate(series: Angles, pendulum: Pendulum) -> float:
-    """What time is measured by [rad/s]: the slow mode, or rods that turn much faster."""
-    times, values = series
-    swing = (
-        float(normal_modes(pendulum)[0].frequency)
-        if pendulum.g > 0
-        else math.sqrt(-float(pendulum.g / pendulum.l1))
-    )
-    turning = [
-        np.median(np.abs(wrapped(np.diff(column[there]))) / np.diff(times[there]))
-        for column in values
-        if np.any(there := np.isfinite(column))
-    ]
-    rate = max(swing, float(np.max(turning)) / _FASTER, 1 / (times[-1] - times[0]))
-    if not math.isfinite(rate):
-        raise ValueError(
-            f"times and pendulum must give finite rates, got l1 = {pendulum.l1:g} m, "
-            f"g = {pendulum.g:g} m/s^2 and times {times[-1] - times[0]:.3g} s long: give SI units"
-        )
-    spacing = float(np.median(np.diff(times)))
-    if spacing * rate > _COARSEST:
-        raise ValueError(
-            f"times must be at most {_COARSEST / rate:.2g} s apart in the median to follow this "
-            f"pendulum, "
-            f"got {spacing:.3g} s: give seconds, more samples, or a pendulum nearer to it"
-        )
-    if (times[-1] - times[0]) * rate > _LONGEST:
-        raise ValueError(
-            f"times must last at most {_LONGEST / rate:.2g} s with this pendulum, got "
-            f"{times[-1] - times[0]:.3g} s: "
-            "give seconds, or fewer of them"
-        )
-    return rate
+class _Task(NamedTuple):
+    """What is asked, and the data in windows."""
+
+    series: Angles
+    pendulum: Pendulum
+    free: tuple[str, ...]
+    sigma: float | None
+    problem: WindowedData
 
 
-# A chaotic motion's rods turn some times as fast as the slow mode, in the median: faster ones
-# shorten the windows.
-_FASTER = 4.0
-# A quarter of a period between samples shows nothing of a swing; a million radians are a slip of
-# the unit.
-_COARSEST, _LONGEST = math.pi / 2, 1e6
+class _Quantity(NamedTuple):
+    """An estimate and its standard error."""
+
+    value: np.float64
+    error: np.float64
 
 
-def _check_fast_mode(pendulum: Pendulum, interval: float) -> None:
-    """Refuses a start whose fast mode takes more integration steps from sample to sample than are
-    ever made.
-    """
-    rate = float(fast_frequency(pendulum))
-    if not rate * interval <= MOST_TURN:
-        raise ValueError(
-            f"pendulum must have a fast mode of at most {MOST_TURN / interval:.3g} rad/s to be "
-            f"followed in intervals "
-            f"of {interval:.3g} s, got {rate:.3g} rad/s: start nearer to what was measured, or "
-            f"give more samples"
-        )
-
-
-def _result(
-    series: Angles,
-    pendulum: Pendulum,
-    free: tuple[str, ...],
-    problem: Problem,
-    found: Found,
-    settings: Settings,
-    sigma: float | None,
-    change: float,
-    iterations: int,
-) -> Fit:
-    fitted = fitted_angles(problem, found.point, settings.steps[1], series)
-    residuals = wrapped(series.values - fitted)
+def _result(task: _Task, found: Found, settings: Settings, change: float, iterations: int) -> Fit:
+    series, pendulum, free, sigma, problem = task
+    fitted = angles_at_samples(problem, found.point, settings.steps[1], series)
+    residuals = wrap(series.values - fitted)
     noise = math.sqrt(found.misses.squares / problem.freedom)
-    known = _knowledge(problem, found, settings, sigma or noise)
-    noisy = _is_noise(residuals, noise, settings.noise, problem.freedom)
+    known = find_uncertainty(problem, found, settings, sigma or noise)
+    noisy = is_noise(residuals, noise, settings.noise, problem.freedom)
     factors = dict(zip(free, np.exp(found.point.fields), strict=True))
     values = {
         name: np.float64(getattr(pendulum, name) * factors.get(name, 1.0)) for name in _BY_FIELD
     }
-    # Where nothing was fitted these are NaN, which no constructor takes: the status tells.
-    best = jax.tree.unflatten(
-        jax.tree.structure(pendulum), [jnp.asarray(value) for value in values.values()]
-    )
     node = found.point.nodes[:, 0]
-    ratios = np.array(
-        [values["l2"] / values["l1"], values["m2"] / values["m1"], values["g"] / values["l1"]]
-    )
-    scale = np.append([values[name] for name in free], np.ones(4))
-    covariance = known.covariance * np.outer(scale, scale)
-    errors = np.sqrt(np.diag(covariance))
-    names = (*free, *RATIOS, *INITIAL)
-    estimates = np.concatenate([scale[: len(free)], ratios, node])
-    deviations = np.concatenate(
-        [errors[: len(free)], known.ratios * np.abs(ratios), errors[len(free) :]]
-    )
+    # A fit that failed may hold NaN, which no constructor takes: the status says so.
+    shape = jax.tree.structure(pendulum)
+    best = jax.tree.unflatten(shape, [jnp.asarray(value) for value in values.values()])
+    state = momenta(best, *(jnp.asarray(component) for component in node))
+    quantities, covariance = _quantities(values, free, node, known)
     return Fit(
         pendulum=best,
-        state=State(
-            *(
-                jnp.asarray(leaf)
-                for leaf in jax.tree.leaves(momenta(best, *(jnp.asarray(x) for x in node)))
-            )
-        ),
-        estimates=dict(zip(names, estimates, strict=True)),
-        standard_errors=dict(zip(names, deviations, strict=True)),
+        state=State(*(jnp.asarray(leaf) for leaf in jax.tree.leaves(state))),
+        estimates={name: quantity.value for name, quantity in quantities.items()},
+        standard_errors={name: quantity.error for name, quantity in quantities.items()},
         covariance=covariance,
         time=series.times,
         theta1=fitted[0],
@@ -488,6 +322,22 @@ def _result(
         windows=np.asarray(problem.times.size),
         iterations=np.asarray(iterations),
         error_estimate=np.float64(change),
-        status=np.asarray(int(_status(problem, found, known.determined, noisy, settings.noise))),
+        status=np.asarray(int(fit_status(problem, found, known.determined, noisy, settings.noise))),
         free=free,
     )
+
+
+def _quantities(
+    values: dict[str, np.float64], free: tuple[str, ...], node: np.ndarray, known: Uncertainty
+) -> tuple[dict[str, _Quantity], np.ndarray]:
+    """All estimates by name, and the covariance of the fields and the first node in their units."""
+    scale = np.append([values[name] for name in free], np.ones(len(INITIAL)))
+    covariance = known.covariance * np.outer(scale, scale)
+    errors = np.sqrt(np.diag(covariance))
+    ratios = [
+        values[over] / values[under] for over, under in (ratio.split("/") for ratio in RATIOS)
+    ]
+    names = (*free, *RATIOS, *INITIAL)
+    estimates = (*scale[: len(free)], *ratios, *node)
+    deviations = (*errors[: len(free)], *known.ratios * np.abs(ratios), *errors[len(free) :])
+    return dict(zip(names, map(_Quantity, estimates, deviations), strict=True)), covariance

@@ -7,9 +7,36 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dpend.inverse.measurements import wrapped
-from dpend.inverse.windows import FARTHEST, Point, Problem, Settings, linearised, run
+from dpend.inverse.measurements import wrap
+from dpend.inverse.windows import FARTHEST, Point, Settings, WindowedData, linearise, run
 from dpend.status import Status
+
+# Off-diagonals on either side of the banded matrix.
+_BAND = 7
+# Information below this share of its largest term is rounding error, not information.
+ROUNDED = 1e-13
+# The prices of a joint, one round of descent each, before the joints are closed. At price s, a miss
+# of s [rad, and in rad/s times the slow frequency] costs as much as an angle's residual of 1 rad.
+PRICES = (0.3, 0.03, 0.003)
+# A weak prior: moving the logarithm of a field by this much costs as much as one residual of the
+# size of the noise. It matters only for fields that the data do not determine, and the last
+# iterations drop it.
+_FAR = 0.5
+# The most evaluations of a descent, and the most of Gauss and Newton's iterations.
+_MOST_TRIALS, _MOST_ITERATIONS = 25, 25
+# A descent ends when an iteration damped by at most `_FREELY` gains less than this share of the
+# cost.
+_LITTLE, _FREELY = 0.1, 1e-2
+# The last iteration moves no field by more than this share of its standard error ...
+_TOLERANCE = 1e-4
+# ... or by rounding. Data without noise show rounding as moves below `_NOISE` that do not shrink.
+_ROUNDING, _NOISE = 1e-12, 1e-8
+# Joints are closed if they miss by less than this [rad, rad/s]. Rounding over a window makes some
+# 1e-13 at tens of rad/s.
+_CLOSED = 1e-9
+# The integration error may move the fields by this share of a standard error. The step is halved
+# for it at most so often.
+_SMALL_SHARE, _HALVINGS = 0.1, 3
 
 
 class _Misses(NamedTuple):
@@ -26,12 +53,14 @@ class _Misses(NamedTuple):
         return cost if math.isfinite(cost) else math.inf
 
 
-def misses_of(problem: Problem, nodes: np.ndarray, angles: np.ndarray, ends: np.ndarray) -> _Misses:
+def misses_of(
+    problem: WindowedData, nodes: np.ndarray, angles: np.ndarray, ends: np.ndarray
+) -> _Misses:
     joints = ends[:, :-1] - nodes[:, 1:]
-    joints[:2] = wrapped(joints[:2])
+    joints[:2] = wrap(joints[:2])
     return _Misses(
-        np.where(problem.seen, wrapped(np.moveaxis(angles, 1, 0) - problem.measured), 0.0),
-        np.where(problem.first_seen, wrapped(nodes[:2, 0] - problem.first), 0.0),
+        np.where(problem.seen, wrap(np.moveaxis(angles, 1, 0) - problem.measured), 0.0),
+        np.where(problem.first_seen, wrap(nodes[:2, 0] - problem.first), 0.0),
         joints,
     )
 
@@ -41,9 +70,7 @@ class _Linear(NamedTuple):
 
     misses: _Misses
     extra: float  # what the fields themselves cost
-    normal: (
-        np.ndarray
-    )  # (K, 7, 7), of each window's angles with respect to its node and the three logarithms
+    normal: np.ndarray  # (K, 7, 7), of a window's angles by its node and the three logarithms
     gradient: np.ndarray  # (K, 7)
     by_node: np.ndarray  # (K - 1, 4, 4), of the windows' ends
     by_logs: np.ndarray  # (K - 1, 4, 3)
@@ -55,9 +82,9 @@ class _Linear(NamedTuple):
         return self.misses.cost(price) + self.extra if self.within else math.inf
 
 
-def _linear(problem: Problem, point: Point, steps: int, prior: float = 0.0) -> _Linear:
+def _linear(problem: WindowedData, point: Point, steps: int, prior: float = 0.0) -> _Linear:
     """Arguments: prior: what the fields' distance from their start costs."""
-    angles, ends, by_angles, by_ends = run(problem, point, steps, linearised)
+    angles, ends, by_angles, by_ends = run(problem, point, steps, linearise)
     misses = misses_of(problem, point.nodes, angles, ends)
     rows = np.where(problem.seen, np.moveaxis(by_angles, 2, 1), 0.0)
     normal = np.einsum("icrk,jcrk->kij", rows, rows, optimize=True)
@@ -93,22 +120,12 @@ def _linear(problem: Problem, point: Point, steps: int, prior: float = 0.0) -> _
 class _Step(NamedTuple):
     nodes: np.ndarray
     fields: np.ndarray
-    information: (
-        np.ndarray
-    )  # of the fields, nodes eliminated: inverse of their covariance over the noise's variance
+    information: np.ndarray  # (F, F), of the fields: inverse covariance times the noise's variance
     response: np.ndarray  # (F, 4, K), of the nodes to the fields
-    alone: (
-        np.ndarray
-    )  # (4, 4), covariance of the first node with the fields held, over the noise's variance
+    alone: np.ndarray  # (4, 4), the first node's covariance at held fields, over that variance
 
 
-# Off-diagonals on either side of the banded matrix.
-_BAND = 7
-# What is left of information that cancels, in units of what it cancelled from.
-ROUNDED = 1e-13
-
-
-def _banded(linear: _Linear, price: np.ndarray, damping: float) -> np.ndarray:
+def _band_matrix(linear: _Linear, price: np.ndarray, damping: float) -> np.ndarray:
     """The symmetric matrix of the unknowns x_0, y_0, x_1, y_1, ..., x_(K-1) by diagonals.
 
     x_k is the move of node k and y_k the multiplier of the joint behind window k, of which the
@@ -134,7 +151,7 @@ def _banded(linear: _Linear, price: np.ndarray, damping: float) -> np.ndarray:
 
 
 def _step(
-    problem: Problem, linear: _Linear, price: np.ndarray, least: float, damping: float = 0.0
+    problem: WindowedData, linear: _Linear, price: np.ndarray, least: float, damping: float = 0.0
 ) -> _Step:
     """The move that solves the linearised problem.
 
@@ -158,7 +175,7 @@ def _step(
     sides[0, :4, free + 1 :] = np.eye(4)
     sides = sides.reshape(8 * count, -1)[:-4]
     solved = solve_banded(
-        (_BAND, _BAND), _banded(linear, price, damping), sides, check_finite=False
+        (_BAND, _BAND), _band_matrix(linear, price, damping), sides, check_finite=False
     )
     if not np.all(np.isfinite(solved)):
         raise np.linalg.LinAlgError("the nodes are not determined")
@@ -182,27 +199,6 @@ def _step(
     )
 
 
-# What it costs a window's end to miss the next node by this [rad, and in rad/s times the slow
-# frequency] is what an angle's residual of the same size does; one round each, before the joints
-# are closed.
-PRICES = (0.3, 0.03, 0.003)
-# In these rounds it costs as much as a residual of the noise's size to take a field's logarithm
-# this far from its start: what the data say weighs more, where they do; the last iterations do
-# without.
-_FAR = 0.5
-
-_MOST_TRIALS, _MOST_ITERATIONS = 25, 25
-# A round is over when an iteration that is damped by no more than the second gains less than the
-# first, of the cost.
-_LITTLE, _FREELY = 0.1, 1e-2
-# The last iteration moves no parameter by more than this share of its standard error, or by
-# rounding, which data without noise show as small moves that do not shrink.
-_TOLERANCE, _ROUNDING, _NOISE = 1e-4, 1e-12, 1e-8
-# Joints that miss by this [rad, rad/s] are closed: rounding over a window at tens of rad/s is some
-# 1e-13.
-_CLOSED = 1e-9
-
-
 class Found(NamedTuple):
     point: Point
     step: _Step | None  # from that point; None where no iteration could be made
@@ -211,29 +207,29 @@ class Found(NamedTuple):
     status: Status
 
 
-def squared_price(price: float, rate: float) -> np.ndarray:
+def price_squares(price: float, rate: float) -> np.ndarray:
     """The price of a joint's misses by components, shape (4, 1)."""
     return (price * np.array([1.0, 1.0, rate, rate])[:, None]) ** 2
 
 
-def _moved_by(point: Point, step: _Step) -> Point:
+def _apply(point: Point, step: _Step) -> Point:
     return Point(point.nodes + step.nodes, point.fields + step.fields)
 
 
 def descent(
-    problem: Problem, point: Point, price: float, settings: Settings
+    problem: WindowedData, point: Point, price: float, settings: Settings
 ) -> tuple[Point, float, int]:
     """Levenberg and Marquardt's iteration with open joints at this price; the cost it came to, and
     its evaluations.
     """
-    prices = np.broadcast_to(squared_price(price, settings.rate), (4, len(problem.times) - 1))
+    prices = np.broadcast_to(price_squares(price, settings.rate), (4, len(problem.times) - 1))
     prior, least = (settings.noise / _FAR) ** 2, settings.noise**2
     linear = _linear(problem, point, settings.steps[0], prior)
     before, damping, count = linear.cost(prices), 1e-4, 0
     while count < _MOST_TRIALS:
         count += 1
         try:
-            trial = _moved_by(point, _step(problem, linear, prices, least, damping))
+            trial = _apply(point, _step(problem, linear, prices, least, damping))
         except np.linalg.LinAlgError:
             damping *= 100
             continue
@@ -249,7 +245,7 @@ def descent(
     return point, before, count + 1
 
 
-def solved(problem: Problem, point: Point, settings: Settings) -> Found:
+def close_joints(problem: WindowedData, point: Point, settings: Settings) -> Found:
     """Gauss and Newton's iteration with closed joints, at the fine step, from a point whose joints
     nearly are.
 
@@ -274,19 +270,16 @@ def solved(problem: Problem, point: Point, settings: Settings) -> Found:
         still = size <= _TOLERANCE * error or move < _ROUNDING or 0.3 * before < move < _NOISE
         if gap < _CLOSED and still:
             return Found(point, step, linear.misses, count, Status.CONVERGED)
-        point = _moved_by(point, step)
+        point = _apply(point, step)
         linear = _linear(problem, point, settings.steps[1])
         if not math.isfinite(linear.cost(closed + 1.0)):
             return lost._replace(iterations=count + 1)
     return lost._replace(iterations=_MOST_ITERATIONS + 1)
 
 
-# The error of the integration is to move the fields by no more than this share of a standard error;
-# so often is the step halved for it.
-_SMALL_SHARE, _HALVINGS = 0.1, 3
-
-
-def refined(problem: Problem, found: Found, settings: Settings) -> tuple[Found, Settings, float]:
+def refine(
+    problem: WindowedData, found: Found, settings: Settings
+) -> tuple[Found, Settings, float]:
     """A solution whose integration steps are short enough for its noise, and how much half of them
     would move it.
     """
@@ -303,7 +296,7 @@ def refined(problem: Problem, found: Found, settings: Settings) -> tuple[Found, 
         noise = math.sqrt(found.misses.squares / problem.freedom)
         if halving == _HALVINGS or moved_by <= _SMALL_SHARE * noise:
             break
-        again = solved(problem, _moved_by(found.point, step), finer)
+        again = close_joints(problem, _apply(found.point, step), finer)
         if again.step is None:
             break
         found, settings = again._replace(iterations=found.iterations + again.iterations + 1), finer

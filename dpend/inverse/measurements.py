@@ -37,9 +37,24 @@ class Angles(NamedTuple):
 # A local cubic has four coefficients, and its noise is told from three samples more.
 FEWEST = 7
 _COLUMNS = ("theta1", "theta2")
+# An angle beyond this [rad] keeps less of its turn than a camera sees.
+_LARGEST = 1e6
+# The median turn from sample to sample [rad]: beyond this nobody can tell which way a rod went.
+_LARGEST_TURN = 1.0
+# The unit may be wrong if the equation of motion is missed by more than this share of its own size,
+# in squares. Swings in the right unit miss by 0.01 to 0.1 with half a degree of noise at 60 frames
+# a second, and by 0.2 to 0.3 with 5 degrees or at 20 frames. Swings of 90 degrees and more miss by
+# 0.5 to 1 in the wrong unit.
+_DISOBEYED = 0.1
+# It is wrong if another unit misses by less than this share of that. The right unit never missed by
+# twice as much as a wrong one.
+_BETTER = 0.4
+# Half widths of local cubics, in samples; the one that predicts each sample best from the others is
+# taken.
+_HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 13, 16, 20, 26, 33, 42, 55, 70, 90)
 
 
-def checked(times: Any, theta1: Any, theta2: Any) -> Angles:
+def check_angles(times: Any, theta1: Any, theta2: Any) -> Angles:
     """The series as arrays.
 
     Raises:
@@ -183,19 +198,6 @@ def _cell(text: str, name: str, line: int, path: Path, gaps: bool) -> float:
     return value
 
 
-# An angle beyond this [rad] keeps less of its turn than a camera sees.
-_LARGEST = 1e6
-# Turns from sample to sample [rad], in the median: beyond this nobody can tell which way a rod
-# went.
-_LARGEST_TURN = 1.0
-# The share of its own size, in squares, that the equation of motion is missed by: above the first
-# it may be the wrong unit, and is, if another misses by less than the second times that. Swings in
-# the right unit miss by 0.01 to 0.1 with half a degree of noise at 60 frames a second, by 0.2 to
-# 0.3 with 5 degrees or at 20 frames, never by twice as much as in a wrong one; swings of 90 degrees
-# and more miss by 0.5 to 1 in the wrong one.
-_DISOBEYED, _BETTER = 0.1, 0.4
-
-
 def _check(series: Angles, there: list[bool], where: Callable[[str, int], str], unit: str) -> None:
     times, values = series
     if times.size < FEWEST:
@@ -218,7 +220,7 @@ def _check(series: Angles, there: list[bool], where: Callable[[str, int], str], 
             raise ValueError(f"{where(name, i)} must be within {_LARGEST:g} rad of zero, got "
                              f"{column[i]:g} rad: "
                              "take off full turns, or the sample out")  # fmt: skip
-        turns = np.abs(wrapped(np.diff(column[np.isfinite(column)])))
+        turns = np.abs(wrap(np.diff(column[np.isfinite(column)])))
         if given and np.median(turns) > _LARGEST_TURN:
             i = int(np.flatnonzero(np.isfinite(column))[1 + int(np.argmax(turns > _LARGEST_TURN))])
             raise ValueError(
@@ -272,14 +274,9 @@ def _disobedience(series: Angles, factor: float) -> float:
     return float(np.sum(left**2) / max(np.sum(rest**2), 1e-300))
 
 
-def wrapped(angle: Any) -> Any:
+def wrap(angle: Any) -> Any:
     """The angle modulo full turns, in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-# Half the number of samples that a local cubic goes through is one of these: the one that predicts
-# each sample best from the others.
-_HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 13, 16, 20, 26, 33, 42, 55, 70, 90)
 
 
 class Smooth(NamedTuple):

@@ -1,214 +1,142 @@
 """The nearest pendulum that solves a loss, and the least loss, within bounds."""
 
 import itertools
-import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, hamiltonian, released
-from dpend.orbits.find import find_orbit
-from dpend.orbits.orbit import PeriodicOrbit, slopes
+from dpend.inverse.problem import PARAMETERS, DesignProblem, Look
 from dpend.status import Status
 
-Loss = Callable[..., Any]
-
-# What may be free; the index is the place in every vector of unknowns.
-PARAMETERS = ("l1", "l2", "m1", "m2", "g", "theta1")
-_THETA1 = PARAMETERS.index("theta1")
-
-# The longest step [of a logarithm], and the one below which steps are Newton's own and need no
-# search.
-_LONGEST, _LOCAL = 0.5, 1e-5
-# Steps this short end the iteration: an error of the equations is its square.
-_SMALL, _SMALL_STEP_DOWN = 1e-9, 1e-8
-# An iteration that stalls at steps as short as this was stopped by rounding.
-_STALLED = 1e-6
-_LEAST_DAMPING = 2.0**-12
+# SLSQP stops when |x|^2/2 changes by less than this, which rounding seldom allows ...
+_FLAT = 1e-18
+# ... or when a step [of a logarithm] is this short: the error of the equations is its square.
+_SMALL = 1e-9
+# The status with which SLSQP says that it made all its steps.
+_OUT_OF_STEPS = 9
+# The equations' value where there is no orbit, over that at the start: SLSQP's line search then
+# makes a tenth of the step.
+_STEEP = 1e3
+# Near a nearest solution Newton's step, and the slope of |x|^2/2 along the solutions, are so small.
+_NEAR = 1e-6
+# A solution found after more steps may not be the nearest one. Direct ways took 2 to 17; the one of
+# 24 ended at 1.09 times the least distance.
+_MANY = 20
+# Brent's method gives a zero to this [of a logarithm], or to rounding.
+_ROUNDING = 1e-15
 # Equations that are down to this share of where they began have a solution there.
 _SOLVED = 1e-8
-# Places at which one equation for one unknown is looked at on either side of the start for a change
-# of sign.
+# One equation for one unknown is looked at in so many places on either side of the start.
 _PIECES = 16
+# The longest step of a descent [of a logarithm], the step that ends it, and the least share of a
+# step that is tried.
+_LONGEST, _SMALL_STEP_DOWN, _LEAST_DAMPING = 0.5, 1e-8, 2.0**-12
 
 
-class Look(NamedTuple):
-    """What is known at one point; if an orbit is not to be had, its status and no more that
-    counts.
+def _with(x: np.ndarray, free: np.ndarray, values: np.ndarray) -> np.ndarray:
+    x = x.copy()
+    x[free] = values
+    return x
+
+
+class _Stop(Exception):
+    """Ends SciPy's search: the last step was short, or SciPy goes on from where no orbit is."""
+
+
+class _Route:
+    """What SLSQP asks for: the equations and their derivatives; each place is solved for once."""
+
+    def __init__(self, problem: DesignProblem, start: Look) -> None:
+        self.problem, self.free, self.here, self.latest = problem, problem.free, start, start
+        self.steps, self.failure = 0, int(Status.NO_SOLUTION)
+        self.steep = np.full(start.value.shape, _STEEP * max(1.0, np.max(np.abs(start.value))))
+
+    def at(self, values: np.ndarray) -> Look:
+        x = _with(self.here.x, self.free, values)
+        x = np.clip(x, self.problem.low, self.problem.high)
+        if not np.array_equal(x, self.latest.x):
+            self.latest = self.here if np.array_equal(x, self.here.x) else self.problem.at(x)
+            if not self.latest.sound:
+                self.failure = self.latest.status
+        return self.latest
+
+    def equations(self, values: np.ndarray) -> np.ndarray:
+        look = self.at(values)
+        return look.value if look.sound else self.steep
+
+    def derivatives(self, values: np.ndarray) -> np.ndarray:
+        look = self.at(values)
+        if not look.sound:
+            raise _Stop
+        return look.jacobian[:, self.free]
+
+    def accept(self, values: np.ndarray) -> None:
+        look = self.at(values)
+        if not look.sound:
+            raise _Stop
+        size = np.max(np.abs(look.x - self.here.x))
+        self.here, self.steps = look, self.steps + 1
+        if size <= _SMALL:
+            raise _Stop
+
+
+def _nearest(problem: DesignProblem, look: Look, most: int) -> tuple[Look, int, int]:
+    """The nearest solution of loss = 0 that the way from a look leads to, the steps taken, and a
+    status: SLSQP (Kraft 1988), and a last Newton step.
     """
+    from scipy.optimize import minimize
 
-    x: np.ndarray  # (6,)
-    value: np.ndarray  # (k,)
-    jacobian: np.ndarray  # (k, 6), with respect to x
-    orbits: tuple[PeriodicOrbit, ...]
-    slopes: tuple[Any, ...]
-    status: int
-
-    @property
-    def sound(self) -> bool:
-        return self.status == Status.CONVERGED
-
-
-@dataclass
-class Problem:
-    """What is asked; counts the looks."""
-
-    loss: Loss
-    start: Pendulum
-    branches: tuple[str, ...]
-    angles: tuple[float, ...]
-    low: np.ndarray  # bounds of x, both zero where it is not free
-    high: np.ndarray
-    equation: int | None = None  # the only one that is asked, if not all
-    looks: int = 0
-
-    @property
-    def free(self) -> np.ndarray:
-        return np.flatnonzero(self.low < self.high)
-
-    def at(self, x: np.ndarray) -> Look:
-        """The orbits at x, the loss there and its derivatives."""
-        self.looks += 1
-        values = np.array(jax.tree.leaves(self.start)) * np.exp(x[:_THETA1])
-        pendulum, growth = Pendulum(*map(float, values)), math.exp(x[_THETA1])
-        orbits = tuple(
-            find_orbit(pendulum, angle * growth, branch=branch)
-            for branch, angle in zip(self.branches, self.angles, strict=True)
+    route, finished = _Route(problem, look), True
+    try:
+        result = minimize(
+            lambda x: 0.5 * x @ x,
+            look.x[route.free],
+            jac=np.array,
+            method="SLSQP",
+            bounds=np.stack([problem.low, problem.high], axis=1)[route.free],
+            constraints={"type": "eq", "fun": route.equations, "jac": route.derivatives},
+            callback=route.accept,
+            options={"maxiter": most, "ftol": _FLAT},
         )
-        lost = [int(orbit.status) for orbit in orbits if int(orbit.status) != Status.CONVERGED]
-        rates = tuple(slopes(orbit) for orbit in orbits)
-        value, jacobian = (np.asarray(part) for part in _judged(self.loss, orbits, rates))
-        if self.equation is not None:
-            value, jacobian = value[[self.equation]], jacobian[[self.equation]]
-        finite = np.all(np.isfinite(value)) and np.all(np.isfinite(jacobian))
-        status = lost[0] if lost else int(Status.CONVERGED if finite else Status.NONFINITE)
-        return Look(x, value, jacobian, orbits, rates, status)
+        finished = result.status != _OUT_OF_STEPS
+    except _Stop:
+        pass
+    if not finished:
+        return route.here, route.steps, int(Status.MAX_ITERATIONS)
+    last = _polish(problem, route.here)
+    if last is None:
+        return route.here, route.steps, route.failure
+    return last, route.steps + 1, int(Status.CONVERGED)
 
 
-@partial(jax.jit, static_argnames="loss")
-def _judged(
-    loss: Loss, orbits: tuple[PeriodicOrbit, ...], rates: tuple[Any, ...]
-) -> tuple[Scalar, Scalar]:
-    """The loss as a vector, and its derivatives with respect to the logarithms of `PARAMETERS`."""
-
-    def at(logs: Scalar) -> Scalar:
-        moved = (_moved(orbit, rate, logs) for orbit, rate in zip(orbits, rates, strict=True))
-        return jnp.ravel(jnp.asarray(loss(*moved), jnp.float64))
-
-    here = jnp.zeros(len(PARAMETERS))
-    return at(here), jax.jacfwd(at)(here)
-
-
-def _moved(orbit: PeriodicOrbit, rate: Scalar, logs: Scalar) -> PeriodicOrbit:
-    """A centred orbit after a small change of ln parameters, to the first order, which is all that
-    is asked of it.
+def _polish(problem: DesignProblem, look: Look) -> Look | None:
+    """The look after Newton's shortest step, or the one before if rounding makes it worse; None if
+    this is not near a nearest solution: the step is long, or |x| falls along the solutions.
     """
-    parameters = jnp.stack([*jax.tree.leaves(orbit.pendulum), orbit.theta1])
-    theta2, log_time, kappa, log_abs_kappa = rate @ (parameters * logs)
-    theta1, *fields = (parameters * jnp.exp(logs))[jnp.array([_THETA1, 0, 1, 2, 3, 4])]
-    pendulum, state = Pendulum(*fields), released(theta1, orbit.theta2 + theta2)
-    turns = 2 * jnp.pi * jnp.asarray(orbit.turns, jnp.float64)
-    return replace(
-        orbit,
-        pendulum=pendulum,
-        state=state,
-        period=orbit.period * jnp.exp(log_time),
-        energy=hamiltonian(pendulum, state),
-        kappa=orbit.kappa + kappa,
-        log_abs_kappa=orbit.log_abs_kappa + log_abs_kappa,
-        dual=released(turns[0] - state.theta1, turns[1] - state.theta2),
-    )
+    inside = (look.x > problem.low) & (look.x < problem.high)
+    jacobian, step = look.jacobian[:, inside], np.zeros_like(look.x)
+    step[inside] = np.linalg.lstsq(jacobian, -look.value, rcond=None)[0]
+    x = look.x[inside]
+    slope = x - jacobian.T @ np.linalg.lstsq(jacobian.T, x, rcond=None)[0]
+    if not np.all(np.abs(look.value + look.jacobian @ step) <= _NEAR * (1 + np.abs(look.value))):
+        return None
+    if not max(np.max(np.abs(step)), np.max(np.abs(slope), initial=0.0)) <= _NEAR:
+        return None
+    last = problem.at(np.clip(look.x + step, problem.low, problem.high))
+    better = last.sound and np.sum(np.abs(last.value)) <= np.sum(np.abs(look.value))
+    return last if better else look
 
 
-class _Step(NamedTuple):
-    """A step of the free unknowns, and the multipliers of the equations."""
-
-    step: np.ndarray
-    multipliers: np.ndarray
-
-
-def _quadratic(
-    hessian: np.ndarray,
-    slope: np.ndarray,
-    value: np.ndarray,
-    jacobian: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    slack: float = 0.0,
-) -> _Step | None:
-    """The step d that minimises slope.d + d.hessian.d/2 with value + jacobian d = 0 and low <= d <=
-    high; None if the bounds leave no such step. With `slack` the equations cost their squares over
-    twice of it instead.
-
-    The bounds that hold are tried, none first: the first choice that satisfies the conditions of
-    Karush, Kuhn and Tucker is the solution, there being one. Of six unknowns 729 small solves at
-    worst.
-    """
-    n, k = len(slope), len(value)
-    for sides in sorted(itertools.product((0, -1, 1), repeat=n), key=np.count_nonzero):
-        side = np.array(sides)
-        move = side == 0
-        if np.sum(move) < (1 if slack else k) and not (slack and not np.any(move)):
-            continue
-        held = np.where(move, 0.0, np.where(side < 0, low, high))
-        some = np.sum(move)
-        matrix = np.zeros((some + k, some + k))
-        matrix[:some, :some] = hessian[np.ix_(move, move)]
-        matrix[:some, some:], matrix[some:, :some] = jacobian[:, move].T, jacobian[:, move]
-        matrix[some:, some:] = -slack * np.eye(k)
-        right = -np.append((slope + hessian @ held)[move], value + jacobian @ held)
-        try:
-            solution = np.linalg.solve(matrix, right)
-        except np.linalg.LinAlgError:
-            continue
-        step, multipliers = held.copy(), solution[some:]
-        step[move] = solution[:some]
-        pull = slope + hessian @ step + jacobian.T @ multipliers
-        tolerance = 1e-12 * (1 + np.max(np.abs(pull)))
-        inside = np.all(step >= low - 1e-14) and np.all(step <= high + 1e-14)
-        if inside and np.all(side * pull <= tolerance) and np.all(np.isfinite(solution)):
-            return _Step(np.clip(step, low, high), multipliers)
-    return None
-
-
-def _nearest(problem: Problem, look: Look, most: int) -> tuple[Look, int, int]:
-    """The nearest solution of loss = 0, the steps taken, and a status."""
-    free = problem.free
-    hessian, weight, before = np.eye(free.size), 0.0, math.inf
-    for count in range(most):
-        x, jacobian = look.x[free], look.jacobian[:, free]
-        room = problem.low[free] - x, problem.high[free] - x
-        newton = _quadratic(hessian, x, look.value, jacobian, *room)
-        if newton is None:
-            return look, count, int(Status.NO_SOLUTION)
-        step, multipliers = newton
-        size = float(np.max(np.abs(step)))
-        if size <= _SMALL or (before <= _STALLED and size >= before):
-            last = problem.at(_with(look.x, free, x + step))
-            better = last.sound and np.sum(np.abs(last.value)) <= np.sum(np.abs(look.value))
-            return last if better else look, count + 1, int(Status.CONVERGED)
-        largest = 1.5 * float(np.max(np.abs(multipliers)))
-        weight = max(largest, 0.5 * (weight + largest))
-        after = _searched(problem, look, step, weight)
-        if not after.sound:
-            return look, count, after.status
-        hessian = _updated(hessian, look, after, free, multipliers)
-        look, before = after, size
-    return look, most, int(Status.MAX_ITERATIONS)
-
-
-def nearest_of_one(problem: Problem, look: Look, most: int) -> tuple[Look, int, int]:
+def nearest_of_one(problem: DesignProblem, look: Look, most: int) -> tuple[Look, int, int]:
     """One equation for one unknown: where Newton's method leads, unless the loss changes sign
     nearer to the start.
 
-    Looked at are places on both sides at even distances, up to the solution, or up to the bounds if
-    there is none.
+    The places between are `_PIECES` on either side at even distances, up to the solution, or up to
+    the bounds if there is none.
     """
     (i,) = problem.free
     found, steps, status = _nearest(problem, look, most)
@@ -219,19 +147,16 @@ def nearest_of_one(problem: Problem, look: Look, most: int) -> tuple[Look, int, 
     for share in np.arange(1, _PIECES + 1) / _PIECES:
         changes = []
         for side in tuple(last):
-            place = side * share * reach
-            trial = problem.at(
-                _with(look.x, problem.free, np.clip([place], problem.low[i], problem.high[i]))
-            )
+            place = np.clip(side * share * reach, problem.low[i], problem.high[i])
+            trial = problem.at(_with(look.x, problem.free, np.array([place])))
+            before = last.pop(side)
             if not trial.sound:
-                del last[side]
                 continue
-            if trial.value[0] * last[side].value[0] < 0:
-                changes.append(_bracketed(problem, last[side], trial, most))
+            if trial.value[0] * before.value[0] < 0:
+                changes.append(_between(problem, before, trial, most))
             best = min(best, trial, key=lambda one: abs(float(one.value[0])))
-            last[side] = trial
-            if not problem.low[i] < place < problem.high[i]:
-                del last[side]
+            if problem.low[i] < place < problem.high[i]:
+                last[side] = trial
         if changes:
             nearest, more, how = min(changes, key=lambda change: abs(float(change[0].x[i])))
             return nearest, steps + more, how
@@ -241,6 +166,29 @@ def nearest_of_one(problem: Problem, look: Look, most: int) -> tuple[Look, int, 
     return closest, steps + more, _without_solution(how)
 
 
+def _between(problem: DesignProblem, one: Look, other: Look, most: int) -> tuple[Look, int, int]:
+    """The zero between two looks of different sign, by Brent's method."""
+    from scipy.optimize import brentq
+
+    (i,) = problem.free
+    looks = {float(look.x[i]): look for look in (one, other)}
+
+    def value(place: float) -> float:
+        if place not in looks:
+            looks[place] = problem.at(_with(one.x, problem.free, np.array([place])))
+        if not looks[place].sound:
+            raise _Stop
+        return float(looks[place].value[0])
+
+    settings = {"xtol": _ROUNDING, "maxiter": 2 * most, "full_output": True, "disp": False}
+    try:
+        place, result = brentq(value, float(one.x[i]), float(other.x[i]), **settings)
+    except _Stop:
+        return one, len(looks) - 2, next(x.status for x in looks.values() if not x.sound)
+    status = Status.CONVERGED if result.converged else Status.MAX_ITERATIONS
+    return looks[place], result.iterations, int(status)
+
+
 def _without_solution(how: int) -> int:
     """The status of equations of which the least sum of squares has been sought, which ended with
     `how`.
@@ -248,27 +196,28 @@ def _without_solution(how: int) -> int:
     return int(Status.NO_SOLUTION) if how == Status.CONVERGED else how
 
 
-def nearest_of_many(problem: Problem, look: Look, most: int) -> tuple[Look, int, int]:
-    """The nearest solution near the start; where Newton's method finds none, the nearest of those
-    that it finds from the least sum of squares, and from where one parameter alone makes one of the
-    equations true.
+def nearest_of_many(problem: DesignProblem, look: Look, most: int) -> tuple[Look, int, int]:
+    """The nearest solution near the start.
+
+    Where the search finds none, or only after many steps, it begins anew from the least sum of
+    squares, and from where one parameter alone makes one of the equations true. The nearest of all
+    that is found is the answer.
     """
     found, steps, status = _nearest(problem, look, most)
-    if status == Status.CONVERGED:
+    if status == Status.CONVERGED and steps <= _MANY:
         return found, steps, status
-    closest, more, how = least_on_bounds(problem, found, most, _square)
-    steps += more
-    found, more, status = _nearest(problem, closest, most)
-    steps += more
-    if status != Status.CONVERGED and np.max(np.abs(closest.value)) <= _SOLVED * np.max(
-        np.abs(look.value)
-    ):
-        return (
-            closest,
-            steps,
-            int(Status.MAX_ITERATIONS),
-        )  # a solution, but on the way to the nearest one it stalled
     solutions = [found] if status == Status.CONVERGED else []
+    closest, how = found, status
+    if not solutions:
+        start = min(look, found, key=lambda one: float(one.value @ one.value))
+        closest, more, how = least_on_bounds(problem, start, most, _square)
+        found, again, status = _nearest(problem, closest, most)
+        steps += more + again
+        if status == Status.CONVERGED:
+            solutions.append(found)
+        elif np.max(np.abs(closest.value)) <= _SOLVED * np.max(np.abs(look.value)):
+            # A solution, but the way from it to the nearest one stalled.
+            return closest, steps, int(Status.MAX_ITERATIONS)
     for begin in _beginnings(problem, look, most):
         found, more, status = _nearest(problem, begin, most)
         steps += more
@@ -276,14 +225,11 @@ def nearest_of_many(problem: Problem, look: Look, most: int) -> tuple[Look, int,
             solutions.append(found)
     if not solutions:
         return closest, steps, _without_solution(how)
-    return (
-        min(solutions, key=lambda one: float(np.linalg.norm(one.x))),
-        steps,
-        int(Status.CONVERGED),
-    )
+    nearest = min(solutions, key=lambda one: float(np.linalg.norm(one.x)))
+    return nearest, steps, int(Status.CONVERGED)
 
 
-def _beginnings(problem: Problem, look: Look, most: int) -> Iterator[Look]:
+def _beginnings(problem: DesignProblem, look: Look, most: int) -> Iterator[Look]:
     """Looks where one parameter alone makes one of the equations true, the others being as at the
     start.
     """
@@ -297,89 +243,6 @@ def _beginnings(problem: Problem, look: Look, most: int) -> Iterator[Look]:
         problem.looks += alone.looks
         if status == Status.CONVERGED:
             yield problem.at(one.x)
-
-
-def _bracketed(problem: Problem, one: Look, other: Look, most: int) -> tuple[Look, int, int]:
-    """The zero between two looks of different sign: Newton's method, halving where it would leave
-    them.
-    """
-    (i,) = problem.free
-    look = min(one, other, key=lambda side: abs(float(side.value[0])))
-    ends = {math.copysign(1.0, float(side.value[0])): float(side.x[i]) for side in (one, other)}
-    for count in range(2 * most):
-        ends[math.copysign(1.0, float(look.value[0]))] = float(look.x[i])
-        low, high = sorted(ends.values())
-        with np.errstate(divide="ignore"):
-            place = float(look.x[i] - look.value[0] / look.jacobian[0, i])
-        last = abs(place - look.x[i]) <= _SMALL
-        place = place if low < place < high else 0.5 * (low + high)
-        after = problem.at(_with(look.x, problem.free, np.array([place])))
-        if last:
-            better = after.sound and abs(after.value[0]) <= abs(look.value[0])
-            return after if better else look, count + 1, int(Status.CONVERGED)
-        if not after.sound:
-            return look, count, after.status
-        look = after
-    return look, 2 * most, int(Status.MAX_ITERATIONS)
-
-
-def _with(x: np.ndarray, free: np.ndarray, values: np.ndarray) -> np.ndarray:
-    x = x.copy()
-    x[free] = values
-    return x
-
-
-def _searched(problem: Problem, look: Look, step: np.ndarray, weight: float) -> Look:
-    """The look after as much of the step as lowers |x|^2/2 + weight |loss|; one with a failed
-    status if none does.
-
-    Where a step does not, the curvature of the equations is made good before it is halved: a merit
-    as this one would otherwise refuse Newton's steps along a curved solution (Maratos).
-    """
-    free = problem.free
-    x, jacobian = look.x[free], look.jacobian[:, free]
-
-    def merit(here: Look) -> float:
-        return 0.5 * float(here.x @ here.x) + weight * float(np.sum(np.abs(here.value)))
-
-    rate = float(x @ step) - weight * float(np.sum(np.abs(look.value)))
-    size = float(np.max(np.abs(step)))
-    damping, failure = min(1.0, _LONGEST / size), int(Status.NO_SOLUTION)
-    low, high = problem.low[free], problem.high[free]
-    while damping >= _LEAST_DAMPING:
-        trial = problem.at(_with(look.x, free, np.clip(x + damping * step, low, high)))
-        if trial.sound and size <= _LOCAL:
-            return trial
-        if trial.sound and merit(trial) <= merit(look) + 1e-4 * damping * rate:
-            return trial
-        if trial.sound:
-            back = np.linalg.lstsq(jacobian, (1 - damping) * look.value - trial.value, rcond=None)[
-                0
-            ]
-            bent = problem.at(_with(look.x, free, np.clip(trial.x[free] + back, low, high)))
-            if bent.sound and merit(bent) <= merit(look) + 1e-4 * damping * rate:
-                return bent
-        failure = int(Status.NO_SOLUTION) if trial.sound else trial.status
-        damping /= 2
-    return look._replace(status=failure)
-
-
-def _updated(
-    hessian: np.ndarray, old: Look, new: Look, free: np.ndarray, multipliers: np.ndarray
-) -> np.ndarray:
-    """The Hessian of |x|^2/2 + multipliers . loss after a step: BFGS, damped to stay positive
-    definite (Powell).
-    """
-    step = (new.x - old.x)[free]
-    change = step + (new.jacobian - old.jacobian)[:, free].T @ multipliers
-    pushed = hessian @ step
-    curvature, has = float(step @ change), float(step @ pushed)
-    if curvature < 0.2 * has:
-        share = 0.8 * has / (has - curvature)
-        change = share * change + (1 - share) * pushed
-    return (
-        hessian - np.outer(pushed, pushed) / has + np.outer(change, change) / float(step @ change)
-    )
 
 
 class _Scalar(NamedTuple):
@@ -398,7 +261,7 @@ def _square(look: Look) -> _Scalar:
 
 
 def least_on_bounds(
-    problem: Problem, look: Look, most: int, of: Callable[[Look], _Scalar]
+    problem: DesignProblem, look: Look, most: int, of: Callable[[Look], _Scalar]
 ) -> tuple[Look, int, int]:
     """The least value near the start, the steps taken, and a status: L-BFGS on what the bounds
     leave free.
@@ -426,7 +289,7 @@ def least_on_bounds(
             direction = -gradient / max(1.0, float(np.max(np.abs(gradient))))
         if not fresh and np.max(np.abs(direction)) <= _SMALL_STEP_DOWN:
             return look, count, int(Status.CONVERGED)
-        after = _lower(problem, look, direction, gradient, of)
+        after = _step_down(problem, look, direction, gradient, of)
         if not after.sound:
             rounding = abs(gradient @ direction) <= 1e-10 * abs(value)
             return look, count, int(Status.CONVERGED) if rounding else after.status
@@ -449,8 +312,8 @@ def _lbfgs() -> tuple[Callable[..., Any], Callable[..., Any]]:
     return partial(freely, begin), partial(freely, update)
 
 
-def _lower(
-    problem: Problem,
+def _step_down(
+    problem: DesignProblem,
     look: Look,
     direction: np.ndarray,
     gradient: np.ndarray,

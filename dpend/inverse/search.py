@@ -7,9 +7,39 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dpend.inverse.gauss_newton import PRICES, descent, misses_of, squared_price
-from dpend.inverse.measurements import best_width, local_cubics, wrapped
-from dpend.inverse.windows import Point, Problem, Settings, ends_of, run
+from dpend.inverse.gauss_newton import PRICES, descent, misses_of, price_squares
+from dpend.inverse.measurements import best_width, local_cubics, wrap
+from dpend.inverse.windows import Point, Settings, WindowedData, ends_of, run
+
+# A cubic is not trusted across a space of this many usual ones ...
+_WIDE = 3.5
+# ... unless the space is shorter than this, over the slow mode's frequency.
+_SHORT = 0.1
+# All windows are tried at once if more than this share of the nodes is known. Cubics through a gap
+# may do; if not, the residuals show it.
+MOSTLY = 0.9
+# What is tried for a hidden rod: so many angles, and these velocities [of the slow mode's rate].
+_ANGLES, _VELOCITIES = 24, np.linspace(-4.5, 4.5, 13)
+# How many of these starts go on.
+_STARTS = 24
+# How many windows there are at first, tried in this order: some two thirds of a swing. Fewer leave
+# a hidden rod free to go anywhere; a wrong pendulum does not lead through more.
+FIRST = (12, 16, 8)
+# How many windows are added at a time.
+_ADDED = 4
+# How many candidate starts survive each round.
+_LEFT = (8, 5, 4, 3, 2, 2, 1)
+# A candidate is dropped if it costs this many times the best.
+_WORSE = 30.0
+# The search gives up if even the best misses the data by this many times the noise, after the last
+# round above.
+_LOST = 5.0
+# Added windows are at a wrong minimum if an angle costs more than this many variances of the noise.
+_POOR = 3.0
+# The prices of joints behind a gap in the data, where the motion may come out far from them.
+_WIDE_OPEN = (1.0, 0.3, 0.03)
+# Only so many windows are fitted again: what comes next depends on the last swings.
+_LOOKED_BACK = 64
 
 
 class _Start(NamedTuple):
@@ -20,13 +50,12 @@ class _Start(NamedTuple):
     noise: float
 
 
-# A cubic across spaces this many times the usual one, unless that is a small part of a swing, is
-# not to be trusted.
-_WIDE, _SHORT = 3.5, 0.1
-
-
-def smoothed(
-    problem: Problem, times: np.ndarray, angles: np.ndarray, initial: tuple, rate: float
+def smooth_start(
+    problem: WindowedData,
+    times: np.ndarray,
+    angles: np.ndarray,
+    initial: tuple[float | None, ...],
+    rate: float,
 ) -> _Start:
     """Nodes from local cubics through the samples about them, and from what is held."""
     count = problem.times.size
@@ -54,7 +83,7 @@ def smoothed(
 
 
 def all_at_once(
-    problem: Problem, start: _Start, settings: Settings, first: int
+    problem: WindowedData, start: _Start, settings: Settings, first: int
 ) -> tuple[Point, int]:
     """All nodes from the smoothed data, where nearly all are known."""
     point, total = Point(start.nodes, np.zeros(problem.by_free.shape[1])), 0
@@ -64,30 +93,8 @@ def all_at_once(
     return point, total
 
 
-# This share of the nodes is known where all are tried at once: cubics through a gap may do, and if
-# not it will be seen.
-MOSTLY = 0.9
-
-# What is tried for a rod that nothing is known of: angles, and velocities [of the slow mode's rate]
-# to either side; how many of the best go on.
-_ANGLES, _VELOCITIES, _STARTS = 24, np.linspace(-4.5, 4.5, 13), 24
-# How many windows there are at first, tried in this order: some two thirds of a swing, of which
-# fewer leave a hidden rod free to go anywhere, and more are not led through by a wrong pendulum;
-# and how many come at a time.
-FIRST, _ADDED = (12, 16, 8), 4
-# Of many starts, this many are left after each addition, and none that costs so many times the
-# best; all are given up whose misses are, from a second swing on, so many times the noise.
-_LEFT, _WORSE, _LOST = (8, 5, 4, 3, 2, 2, 1), 30.0, 5.0
-# What was added is a wrong minimum if each of its angles costs more than this many times the
-# noise's variance.
-_POOR = 3.0
-_WIDE_OPEN = (1.0, 0.3, 0.03)
-# The windows farther behind are left alone: what comes next depends on the last swings.
-_LOOKED_BACK = 64
-
-
-def _predicted(
-    problem: Problem, start: _Start, point: Point, upto: int, settings: Settings
+def _predict(
+    problem: WindowedData, start: _Start, point: Point, upto: int, settings: Settings
 ) -> Point:
     """The point with nodes up to `upto`: what is known of them from the data, the rest from the
     motion so far.
@@ -100,7 +107,9 @@ def _predicted(
     return Point(np.stack(nodes, axis=1), point.fields)
 
 
-def _candidates(problem: Problem, start: _Start, settings: Settings, windows: int) -> list[Point]:
+def _candidates(
+    problem: WindowedData, start: _Start, settings: Settings, windows: int
+) -> list[Point]:
     """First nodes: the known one, or those of a grid for a hidden rod that do better than their
     neighbours.
     """
@@ -118,7 +127,7 @@ def _candidates(problem: Problem, start: _Start, settings: Settings, windows: in
     for k in range(min(windows, problem.times.size)):
         here = problem._replace(dts=np.repeat(problem.dts[:, k : k + 1], nodes.shape[1], axis=1))
         angles, nodes = run(here, Point(nodes, fields), settings.steps[0], ends_of)
-        missed = wrapped(np.moveaxis(angles, 1, 0) - problem.measured[..., k : k + 1])
+        missed = wrap(np.moveaxis(angles, 1, 0) - problem.measured[..., k : k + 1])
         cost += np.sum(np.where(problem.seen[..., k : k + 1], missed**2, 0.0), axis=(0, 1))
     table = np.pad(
         np.pad(cost.reshape(grid[0].shape), ((1, 1), (0, 0)), "wrap"),
@@ -133,7 +142,7 @@ def _candidates(problem: Problem, start: _Start, settings: Settings, windows: in
 
 
 def window_by_window(
-    problem: Problem, start: _Start, settings: Settings, first: int
+    problem: WindowedData, start: _Start, settings: Settings, first: int
 ) -> tuple[Point, int]:
     """Each node where the motion fitted so far leads, from `first` windows on: for rods and times
     without data.
@@ -143,7 +152,7 @@ def window_by_window(
         upto = min(upto + (_ADDED if upto else first), problem.times.size)
         found = []
         for point in points:
-            cost, after, count = _extended(problem, start, point, upto, settings, len(points) == 1)
+            cost, after, count = _extend(problem, start, point, upto, settings, len(points) == 1)
             total += count
             found.append((cost, after))
             if (
@@ -159,15 +168,15 @@ def window_by_window(
         ]
         seen = problem.part(max(0, upto - _LOOKED_BACK), upto).observations
         if not left and not found[0][0] < (_LOST * settings.noise) ** 2 * max(seen, 1):
-            return _predicted(problem, start, found[0][1], problem.times.size, settings), total
+            return _predict(problem, start, found[0][1], problem.times.size, settings), total
     for price in PRICES[1:]:
         points[0], _, count = descent(problem, points[0], price, settings)
         total += count
     return points[0], total
 
 
-def _extended(
-    problem: Problem, start: _Start, point: Point, upto: int, settings: Settings, alone: bool
+def _extend(
+    problem: WindowedData, start: _Start, point: Point, upto: int, settings: Settings, alone: bool
 ) -> tuple[float, Point, int]:
     """The cost of the last windows up to `upto`, and the point with their nodes fitted.
 
@@ -177,7 +186,7 @@ def _extended(
     """
     before = point.nodes.shape[1]
     if before == 1 or not alone:
-        return _fitted_up_to(problem, start, point, upto, PRICES[before > 1 : 2], settings)
+        return _fit_up_to(problem, start, point, upto, PRICES[before > 1 : 2], settings)
     total, best = 0, (math.inf, math.inf, point)
     for sizes, prices in (
         ((upto,), PRICES[1:2]),
@@ -186,7 +195,7 @@ def _extended(
     ):
         trial = point
         for size in sizes:
-            cost, trial, count = _fitted_up_to(problem, start, trial, size, prices, settings)
+            cost, trial, count = _fit_up_to(problem, start, trial, size, prices, settings)
             total += count
         added = _cost_of_last(problem, trial, upto - before, settings)
         best = min(best, (added, cost, trial), key=lambda found: found[0])
@@ -195,15 +204,15 @@ def _extended(
     return best[1], best[2], total
 
 
-def _fitted_up_to(
-    problem: Problem,
+def _fit_up_to(
+    problem: WindowedData,
     start: _Start,
     point: Point,
     upto: int,
     prices: tuple[float, ...],
     settings: Settings,
 ) -> tuple[float, Point, int]:
-    point = _predicted(problem, start, point, upto, settings)
+    point = _predict(problem, start, point, upto, settings)
     behind = max(0, upto - _LOOKED_BACK)
     part, total, cost = problem.part(behind, upto), 0, math.inf
     recent = Point(point.nodes[:, behind:], point.fields)
@@ -213,11 +222,11 @@ def _fitted_up_to(
     return cost, Point(np.hstack([point.nodes[:, :behind], recent.nodes]), recent.fields), total
 
 
-def _cost_of_last(problem: Problem, point: Point, count: int, settings: Settings) -> float:
+def _cost_of_last(problem: WindowedData, point: Point, count: int, settings: Settings) -> float:
     """What the last windows and the joints before them cost, over what noise may make it."""
     upto = point.nodes.shape[1]
     behind = max(0, upto - count - 1)
     part, recent = problem.part(behind, upto), Point(point.nodes[:, behind:], point.fields)
     angles, ends = run(part, recent, settings.steps[0], ends_of)
-    cost = misses_of(part, recent.nodes, angles, ends).cost(squared_price(PRICES[1], settings.rate))
+    cost = misses_of(part, recent.nodes, angles, ends).cost(price_squares(PRICES[1], settings.rate))
     return cost / (_POOR * settings.noise**2 * (part.observations + 4))

@@ -28,26 +28,52 @@ from jax import lax
 from jaxtyping import Array
 
 from dpend.checks import Scalar
-from dpend.inverse.measurements import Angles
-from dpend.mechanics.pendulum import Pendulum, State, fastest, momenta, velocities
+from dpend.inverse.measurements import Angles, wrap
+from dpend.mechanics.pendulum import (
+    Pendulum,
+    State,
+    fast_frequency,
+    fastest,
+    momenta,
+    normal_modes,
+    velocities,
+)
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import moved, step_size
 
 # Order 8 in (theta, p) with its stages as a loop, which compiles in seconds together with its
 # derivatives. Only its method is used.
 _METHOD = Scheme("rk8", 1.0, written_out=False)
-# Windows side by side in one call; at 128 the slopes of a step outgrow the cache and it takes ten
-# times as long.
+# Windows side by side in one call. At 128 the slopes of a step outgrow the cache, and a call takes
+# ten times as long.
 _LANES = 64
-# The length of a window in units of 1/(the slow mode's frequency): the rods of a chaotic motion,
-# which turn several times as fast, advance by less than a radian or two, and the cubics' velocities
-# lead to its end.
+# The length of a window in units of 1/(the slow mode's frequency). The rods of a chaotic motion
+# turn several times as fast; in this time they advance by less than a radian or two, so that the
+# velocities of the cubics lead to the window's end.
 _WINDOW = 0.375
-# Intervals in a window, the fewest of these that its samples need: one compiled program each.
+# Intervals in a window: the fewest of these that the samples need. Each is one compiled program.
 _INTERVALS = (4, 16, 64, 256)
-# The fastest motion may advance by this in one integration step [rad], before and in the last
-# iterations.
+# An interval is halved if it is longer than its share of a window by more than this much of it.
+_NEARLY_FITS = 0.3
+# The fastest motion advances by at most this in one integration step [rad] before the last
+# iterations, and in them.
 _ROUGH, _FINE = 0.6, 0.25
+# A motion that needs more integration steps in an interval is not the one that was measured.
+_MOST_STEPS = 200
+# The fast mode at the start may advance by this in an interval [rad]: fifty steps. With them the
+# search for a hidden rod takes half a minute; with `_MOST_STEPS` it took four times as long and
+# found nothing.
+_MOST_TURN = 50 * _FINE
+# The farthest a field's logarithm goes from its start. A field a thousand million times its start
+# is not what was measured.
+FARTHEST = math.log(1e9)
+# Rods may turn this many times as fast as the slow mode, in the median, as in a chaotic motion;
+# faster rods shorten the windows.
+_FASTER = 4.0
+# The median time between samples, as an angle of the slow mode [rad]: a quarter of a period.
+_COARSEST = math.pi / 2
+# The longest series, as an angle of the slow mode [rad]: a longer one is a slip of the unit.
+_LONGEST = 1e6
 
 
 def _window(
@@ -68,12 +94,15 @@ def _window(
 
 
 @jax.jit
-def ends_of(gravity, logs, nodes, dts, steps):  # type: ignore[no-untyped-def]
+def ends_of(
+    gravity: Scalar, logs: Array, nodes: Array, dts: Array, steps: Scalar
+) -> tuple[Array, Array]:
+    """Angles and ends of windows, as `_window` gives them, with one pendulum for all."""
     return _window(gravity, jnp.broadcast_to(logs[:, None], (3, nodes.shape[1])), nodes, dts, steps)
 
 
 @jax.jit
-def linearised(gravity, logs, nodes, dts, steps):  # type: ignore[no-untyped-def]
+def linearise(gravity: Scalar, logs: Array, nodes: Array, dts: Array, steps: Scalar) -> Any:
     """The same with derivatives along the four components of the node and the three logarithms, in
     front.
     """
@@ -91,14 +120,12 @@ def linearised(gravity, logs, nodes, dts, steps):  # type: ignore[no-untyped-def
     return jax.vmap(along, out_axes=(None, 0))(jnp.eye(7))
 
 
-class Problem(NamedTuple):
+class WindowedData(NamedTuple):
     """Measured angles laid out in windows."""
 
     gravity: float  # g/l1 at the start [1/s^2]
     logs: np.ndarray  # log of l2/l1 and m2/m1 at the start, and 0
-    by_free: (
-        np.ndarray
-    )  # derivative of the three logarithms with respect to those of the free fields
+    by_free: np.ndarray  # (3, F), derivatives of the logarithms with respect to the free fields'
     times: np.ndarray  # of the nodes
     dts: np.ndarray  # (intervals, K)
     sample: np.ndarray  # the sample at the end of each interval, -1 where there is none
@@ -108,7 +135,7 @@ class Problem(NamedTuple):
     first_seen: np.ndarray
     held: np.ndarray  # (4,), which components of the first node are given
 
-    def part(self, start: int, stop: int) -> "Problem":
+    def part(self, start: int, stop: int) -> "WindowedData":
         """Some of the windows, as if the motion began with them."""
         some = slice(start, stop)
         return self._replace(
@@ -135,7 +162,7 @@ class Point(NamedTuple):
     fields: np.ndarray
 
 
-def run(problem: Problem, point: Point, steps: int, compiled: Any) -> list[np.ndarray]:
+def run(problem: WindowedData, point: Point, steps: int, compiled: Any) -> list[np.ndarray]:
     """The windows' motions, `_LANES` at a time; the last lane is repeated where there are fewer."""
     logs = problem.logs + problem.by_free @ point.fields
     pieces = []
@@ -150,18 +177,15 @@ def run(problem: Problem, point: Point, steps: int, compiled: Any) -> list[np.nd
     return [np.concatenate(piece, axis=-1) for piece in zip(*pieces, strict=True)]
 
 
-# A field that is a thousand million times its start is not what was measured; e^700 would be no
-# double.
-FARTHEST = math.log(1e9)
-
-
 class Settings(NamedTuple):
     rate: float  # of the slow mode at the start [rad/s]
     noise: float  # expected [rad]
     steps: tuple[int, int]  # integration steps in an interval, rough and fine
 
 
-def fitted_angles(problem: Problem, point: Point, steps: int, series: Angles) -> np.ndarray:
+def angles_at_samples(
+    problem: WindowedData, point: Point, steps: int, series: Angles
+) -> np.ndarray:
     """The fitted angles at the samples, shape (2, m), in one piece: nodes may be full turns
     apart.
     """
@@ -176,9 +200,9 @@ def fitted_angles(problem: Problem, point: Point, steps: int, series: Angles) ->
     return fitted
 
 
-def laid_out(
+def lay_windows(
     series: Angles, pendulum: Pendulum, by_free: np.ndarray, held: np.ndarray, rate: float
-) -> Problem:
+) -> WindowedData:
     """The samples in windows; where they are farther apart than an interval is long, there are
     intervals without.
 
@@ -200,7 +224,7 @@ def laid_out(
     sample = np.pad(sample, fill, constant_values=-1).reshape(count, intervals).T
     there = np.isfinite(values)
     seen = (sample >= 0) & there[:, np.maximum(sample, 0)]
-    return Problem(
+    return WindowedData(
         gravity=float(pendulum.g / pendulum.l1),
         logs=np.array(
             [math.log(pendulum.l2 / pendulum.l1), math.log(pendulum.m2 / pendulum.m1), 0.0]
@@ -217,12 +241,8 @@ def laid_out(
     )
 
 
-# An interval may be longer than its share of a window by this much of it, rather than be halved.
-_NEARLY_FITS = 0.3
-
-
 def settings_for(
-    problem: Problem,
+    problem: WindowedData,
     nodes: np.ndarray,
     known: np.ndarray,
     rate: float,
@@ -245,9 +265,50 @@ def settings_for(
     return Settings(rate, noise, (rough, fine))
 
 
-# A motion that asks for more integration steps in an interval is not the one that was measured.
-_MOST_STEPS = 200
-# The fast mode at the start may advance by so much in an interval [rad], in fifty steps: the search
-# for a hidden rod then takes half a minute, and with all of the steps above it took four times as
-# long and found nothing.
-MOST_TURN = 50 * _FINE
+def time_rate(series: Angles, pendulum: Pendulum) -> float:
+    """What time is measured by [rad/s]: the slow mode, or rods that turn much faster."""
+    times, values = series
+    swing = (
+        float(normal_modes(pendulum)[0].frequency)
+        if pendulum.g > 0
+        else math.sqrt(-float(pendulum.g / pendulum.l1))
+    )
+    turning = [
+        np.median(np.abs(wrap(np.diff(column[there]))) / np.diff(times[there]))
+        for column in values
+        if np.any(there := np.isfinite(column))
+    ]
+    rate = max(swing, float(np.max(turning)) / _FASTER, 1 / (times[-1] - times[0]))
+    if not math.isfinite(rate):
+        raise ValueError(
+            f"times and pendulum must give finite rates, got l1 = {pendulum.l1:g} m, "
+            f"g = {pendulum.g:g} m/s^2 and times {times[-1] - times[0]:.3g} s long: give SI units"
+        )
+    spacing = float(np.median(np.diff(times)))
+    if spacing * rate > _COARSEST:
+        raise ValueError(
+            f"times must be at most {_COARSEST / rate:.2g} s apart in the median to follow this "
+            f"pendulum, "
+            f"got {spacing:.3g} s: give seconds, more samples, or a pendulum nearer to it"
+        )
+    if (times[-1] - times[0]) * rate > _LONGEST:
+        raise ValueError(
+            f"times must last at most {_LONGEST / rate:.2g} s with this pendulum, got "
+            f"{times[-1] - times[0]:.3g} s: "
+            "give seconds, or fewer of them"
+        )
+    return rate
+
+
+def check_fast_mode(pendulum: Pendulum, interval: float) -> None:
+    """Refuses a start whose fast mode takes more integration steps from sample to sample than are
+    ever made.
+    """
+    rate = float(fast_frequency(pendulum))
+    if not rate * interval <= _MOST_TURN:
+        raise ValueError(
+            f"pendulum must have a fast mode of at most {_MOST_TURN / interval:.3g} rad/s to be "
+            f"followed in intervals "
+            f"of {interval:.3g} s, got {rate:.3g} rad/s: start nearer to what was measured, or "
+            f"give more samples"
+        )

@@ -101,7 +101,7 @@ def test_two_returns_meet_where_a_family_turns_back(paper):
 
 def test_cells_halved_in_time_are_the_same_bicubic():
     net = np.random.default_rng(0).normal(size=(4, 4, 2, 3))
-    cells = _Cells(net, np.zeros(3), np.arange(3), np.zeros(3)).halved(np.array([0, 2]), 0)
+    cells = _Cells(net, np.zeros(3), np.arange(3), np.zeros(3)).halve(np.array([0, 2]), 0)
 
     def value(net, x, y):
         weights = [

@@ -13,7 +13,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 import dpend
 from dpend import Pendulum, Status
-from dpend.inverse.nearest import PARAMETERS
+from dpend.inverse.problem import PARAMETERS
 from dpend.orbits.orbit import slopes
 from dpend.orbits.stability import kappa_of_monodromy, transition
 
