@@ -201,7 +201,7 @@ def solve_transposed(factors: Factors, right: Array) -> Array:
 
 
 @jax.jit
-def laid(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -> Array:
+def lay_arc(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -> Array:
     """Nodes and log Delta of an arc of `duration` on an orbit of which some states are known.
 
     Arguments:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpend.orbits.curve import curve_of, joined, some_of
-from dpend.orbits.follow import Problem
-from dpend.orbits.newton import METRIC, Corrected
+from dpend.orbits.curve import concatenate, curve_of, select
+from dpend.orbits.follow import FamilyProblem
+from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.samples import Samples, Spot, Track, measure_of
 from dpend.orbits.walk import CROSSING
 
@@ -20,9 +20,9 @@ class Zone:
 
     place: float  # of the crossing
     ends: np.ndarray
-    rows: Corrected  # at both ends
+    rows: Solved  # at both ends
 
-    def row_at(self, problem: Problem, where: float) -> Corrected:
+    def row_at(self, problem: FamilyProblem, where: float) -> Solved:
         """The point at an arclength in it; slopes there are those between its ends.
 
         Where no Newton's iteration converges, on the crossing itself, a point next to it stands for
@@ -31,7 +31,7 @@ class Zone:
         chord, index = curve_of(self.rows), np.zeros(len(_BESIDE), int)
         shares = (where + np.array(_BESIDE) - self.ends[0]) / (self.ends[1] - self.ends[0])
         tangents, steps = chord.tangents_between(index, shares), chord.steps[index + 1]
-        rows = problem.corrected(chord.between(index, shares), METRIC * tangents, steps)
+        rows = problem.correct(chord.between(index, shares), METRIC * tangents, steps)
         best = int(np.argmax(rows.converged > 0))
         mixed = {
             name: np.einsum("i,i...->...", [1 - shares[0], shares[0]], getattr(self.rows, name))[
@@ -39,9 +39,9 @@ class Zone:
             ]
             for name in ("tangent", "time_slope", "energy_slope")
         }
-        return some_of(rows, slice(best, best + 1))._replace(**mixed)
+        return select(rows, slice(best, best + 1))._replace(**mixed)
 
-    def steepness(self, problem: Problem) -> float:
+    def steepness(self, problem: FamilyProblem) -> float:
         """The slope of c, of brake orbits kappa, between its ends."""
         return float(
             np.diff(measure_of(self.rows, problem.symmetry))[0] / (self.ends[1] - self.ends[0])
@@ -91,14 +91,14 @@ def outside(zones: Sequence[Zone], samples: Samples, *, with_ends: bool = False)
     for zone in zones:
         inside = (samples.where >= zone.ends[0]) & (samples.where <= zone.ends[1])
         apart &= ~inside if with_ends else ~inside | np.isin(samples.where, zone.ends)
-    kept = Samples(samples.where[apart], some_of(samples.rows, apart))
+    kept = Samples(samples.where[apart], select(samples.rows, apart))
     return merged(kept, *(Samples(zone.ends, zone.rows) for zone in zones)) if with_ends else kept
 
 
 def merged(*parts: Samples) -> Samples:
     where = np.concatenate([part.where for part in parts])
     order = np.argsort(where, kind="stable")
-    return Samples(where[order], some_of(joined(*(part.rows for part in parts)), order))
+    return Samples(where[order], select(concatenate(*(part.rows for part in parts)), order))
 
 
 def overlaps(spot: Spot, crossings: Sequence[Spot]) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dpend.orbits.newton import METRIC, Corrected
+from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.walk import hermite
 
 
@@ -44,23 +44,23 @@ class Curve:
 LEAVING, SAME_PLACE = 4, 1e-7
 
 
-def cut_at_return(rows: Corrected, count: int) -> tuple[Corrected, str]:
+def cut_at_return(rows: Solved, count: int) -> tuple[Solved, str]:
     """A curve that has come back after `count` points: closed, unless it only turned round at a
     branch point.
 
     Where it meets a more symmetric family, a curve goes on through the same orbits, met at their
     other rests, as often as it took to get there.
     """
-    rows = some_of(rows, slice(count))
+    rows = select(rows, slice(count))
     lengths = np.cumsum(curve_of(rows).lengths)
     (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
     half = [i for i in crossings if abs(lengths[i] - 0.5 * lengths[-1]) < _MIDDLE * lengths[-1]]
-    return (some_of(rows, slice(half[0] + 1)), "branch point") if half else (rows, "closed")
+    return (select(rows, slice(half[0] + 1)), "branch point") if half else (rows, "closed")
 
 
-def without_its_image(
-    rows: Corrected, ends: tuple[str, str], here: int
-) -> tuple[Corrected, tuple[str, str]]:
+def drop_mirror_half(
+    rows: Solved, ends: tuple[str, str], here: int
+) -> tuple[Solved, tuple[str, str]]:
     """The part of a curve of brake orbits with the point `here` that does not hold them a second
     time, and its ends.
 
@@ -72,31 +72,31 @@ def without_its_image(
         if not _reflects(rows, i):
             continue
         if here <= i:
-            return without_its_image(some_of(rows, slice(i + 1)), (ends[0], "branch point"), here)
-        return without_its_image(
-            some_of(rows, slice(i + 1, None)), ("branch point", ends[1]), here - i - 1
+            return drop_mirror_half(select(rows, slice(i + 1)), (ends[0], "branch point"), here)
+        return drop_mirror_half(
+            select(rows, slice(i + 1, None)), ("branch point", ends[1]), here - i - 1
         )
     return rows, ends
 
 
-def half_of_closed(rows: Corrected) -> Corrected | None:
+def half_of_closed(rows: Solved) -> Solved | None:
     """Of a closed curve that holds its orbits twice, from a branch point to another and back, the
     half it begins in.
     """
     (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
     if crossings.size < 2 or not _reflects(rows, crossings[0]):
         return None
-    return joined(
-        some_of(rows, slice(crossings[-1] + 1, None)), some_of(rows, slice(crossings[0] + 1))
+    return concatenate(
+        select(rows, slice(crossings[-1] + 1, None)), select(rows, slice(crossings[0] + 1))
     )
 
 
-def _reflects(rows: Corrected, crossing: Any) -> bool:
+def _reflects(rows: Solved, crossing: Any) -> bool:
     """Whether the points on both sides of a crossing are each other's images: their orbits' other
     rests, in the mirror or not.
     """
     shorter, longer = sorted(
-        (some_of(rows, slice(crossing + 1)), some_of(rows, slice(crossing + 1, None))),
+        (select(rows, slice(crossing + 1)), select(rows, slice(crossing + 1, None))),
         key=lambda part: len(part.point),
     )
     if len(shorter.point) < LEAVING:
@@ -118,7 +118,7 @@ _IMAGE = 0.05
 _MIDDLE = 0.1
 
 
-def release_and_time(rows: Corrected) -> np.ndarray:
+def release_and_time(rows: Solved) -> np.ndarray:
     """(theta1, theta2, log of the time), which tell orbits of one symmetry apart."""
     return np.concatenate([rows.point[:, :2], np.log(rows.times.sum(axis=1))[:, None]], axis=1)
 
@@ -144,17 +144,17 @@ def away_from(
     return np.linalg.norm(to - share[:, None] * chord, axis=1), length
 
 
-def some_of(rows: Corrected, which: Any) -> Corrected:
-    return Corrected(*(column[which] for column in rows))
+def select(rows: Solved, which: Any) -> Solved:
+    return Solved(*(column[which] for column in rows))
 
 
-def joined(*parts: Corrected) -> Corrected:
-    return Corrected(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+def concatenate(*parts: Solved) -> Solved:
+    return Solved(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def turned(rows: Corrected) -> Corrected:
+def reversed_(rows: Solved) -> Solved:
     """The same points, met in the opposite order."""
-    back = some_of(rows, slice(None, None, -1))
+    back = select(rows, slice(None, None, -1))
     return back._replace(
         tangent=-back.tangent,
         time_slope=-back.time_slope,
@@ -163,5 +163,5 @@ def turned(rows: Corrected) -> Corrected:
     )
 
 
-def curve_of(rows: Corrected) -> Curve:
+def curve_of(rows: Solved) -> Curve:
     return Curve(rows.point, rows.tangent, rows.steps)

@@ -31,20 +31,20 @@ from dpend.mechanics.units import natural
 from dpend.orbits.arc import PARTS
 from dpend.orbits.curve import (
     Curve,
+    concatenate,
     curve_of,
+    drop_mirror_half,
     half_of_closed,
-    joined,
-    turned,
+    reversed_,
     way_to,
-    without_its_image,
 )
 from dpend.orbits.find import swinging_pendulum
-from dpend.orbits.follow import Problem, Reach, begun, laid_out, repeated
-from dpend.orbits.newton import METRIC, Corrected
+from dpend.orbits.follow import FamilyProblem, Reach, guess_arc, repeated, start_at
+from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit, Slopes, mirrored, orbits_of, slopes_of
 from dpend.orbits.samples import SpecialPoint
 from dpend.orbits.special import special_points
-from dpend.orbits.walk import FIRST_STEP, beginning
+from dpend.orbits.walk import FIRST_STEP, STRAYED, start_at_mode
 from dpend.status import Status, message
 
 # The longest step: a hundred points or so for a family, close enough for cubics to show every turn.
@@ -81,7 +81,7 @@ class Family:
     status: Scalar
     ends: tuple[str, str] = field(metadata={"static": True})
     _curve: "Curve" = field(repr=False, metadata={"static": True})
-    _problem: "Problem" = field(repr=False)
+    _problem: "FamilyProblem" = field(repr=False)
 
     @property
     def symmetry(self) -> str:
@@ -155,9 +155,9 @@ def _at(family: Family, theta1: Scalar, crossing: int | Any) -> PeriodicOrbit:
     points[:, 0] = np.where(points[:, 0] < 0, -targets, targets)
     rows = np.zeros_like(points)
     rows[:, 0] = 1.0
-    solved = problem.corrected(points, rows, curve.steps[np.maximum(index, 0) + 1])
+    solved = problem.correct(points, rows, curve.steps[np.maximum(index, 0) + 1])
     away = np.sqrt(np.sum(METRIC * (solved.point - points) ** 2, axis=1))
-    strayed = away > np.maximum(_STRAYED * curve.lengths[np.maximum(index, 0)], 1e-9)
+    strayed = away > np.maximum(STRAYED * curve.lengths[np.maximum(index, 0)], 1e-9)
     traced = any(
         isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((theta1, problem.pendulum))
     )
@@ -192,11 +192,6 @@ def _at(family: Family, theta1: Scalar, crossing: int | Any) -> PeriodicOrbit:
 
     wide = jax.tree.map(lambda leaf: jnp.reshape(leaf, wanted.shape), orbits.pendulum)
     return replace(jax.tree.map(shaped, orbits), pendulum=wide)
-
-
-# The cubic is true to a few thousandths of its interval: a root further away than this share of it
-# is another orbit.
-_STRAYED = 0.1
 
 
 def _passages(curve: Curve, targets: np.ndarray, crossing: int) -> tuple[np.ndarray, np.ndarray]:
@@ -280,7 +275,7 @@ def follow_family(
             raise ValueError(
                 f"start must be one of {', '.join(BRANCHES)}, or an orbit, got {start!r}: give one"
             )
-        return _from_mode(Problem(pendulum, scaled, "centred", (0.0, 0.0)), start, reach)
+        return _from_mode(FamilyProblem(pendulum, scaled, "centred", (0.0, 0.0)), start, reach)
     if isinstance(start, SpecialPoint):
         return _from_branch_point(pendulum, start, reach)
     return _from_orbit(pendulum, scaled, start, reach)
@@ -302,10 +297,10 @@ def _primal(pendulum: Any) -> Pendulum:
     return swinging_pendulum(Pendulum(**numbers))  # which refuses what `jit` traces
 
 
-_beginning = jax.jit(beginning)
+_beginning = jax.jit(start_at_mode)
 
 
-def _from_mode(problem: Problem, branch: str, reach: Reach) -> Family:
+def _from_mode(problem: FamilyProblem, branch: str, reach: Reach) -> Family:
     start = jax.tree.map(np.asarray, _beginning(problem.natural, branch == "in-phase"))
     rows, end = problem.followed(start, None, reach)
     if not len(rows.point):
@@ -357,11 +352,11 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reac
     }
     symmetry = orbit.symmetry
     full = turns.get(symmetry, np.zeros(2))
-    problem = Problem(pendulum, scaled, symmetry, (float(full[0]), float(full[1])))
+    problem = FamilyProblem(pendulum, scaled, symmetry, (float(full[0]), float(full[1])))
     if orbit.period / second > reach.period * (1 + 1e-12):
         raise _too_short(reach)
     duration = float(orbit.period) / second / PARTS[symmetry]
-    point = laid_out(problem, np.zeros(1), state[None], duration)
+    point = guess_arc(problem, np.zeros(1), state[None], duration)
     rows = problem.on_curve(point)
     if rows is None or np.linalg.norm(way_to(rows.point[0, :2], state[:2])) > _SAME_ORBIT:
         raise ValueError(
@@ -375,36 +370,36 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reac
 _SAME_ORBIT = 1e-5
 
 
-def _both_ways(problem: Problem, rows: Corrected, reach: Reach) -> Family:
+def _both_ways(problem: FamilyProblem, rows: Solved, reach: Reach) -> Family:
     """The family through a point, in both directions unless it is closed."""
     first = min(FIRST_STEP, reach.step)
-    start = begun(rows.point[0], rows.tangent[0], first, rows.steps[0])
+    start = start_at(rows.point[0], rows.tangent[0], first, rows.steps[0])
     ahead, end = problem.followed(start, rows, reach)
     if end == "closed":
         return _closed(problem, rows, ahead)
     behind, begin = problem.followed(start._replace(tangent=-start.tangent), rows, reach)
-    whole, ends, here = joined(turned(behind), rows, ahead), (begin, end), len(behind.point)
+    whole, ends, here = concatenate(reversed_(behind), rows, ahead), (begin, end), len(behind.point)
     if problem.symmetry == "brake":
-        whole, ends = without_its_image(whole, ends, here)
+        whole, ends = drop_mirror_half(whole, ends, here)
     return _family(problem, whole, curve_of(whole), ends)
 
 
-def _closed(problem: Problem, start: Corrected, ahead: Corrected) -> Family:
+def _closed(problem: FamilyProblem, start: Solved, ahead: Solved) -> Family:
     """A curve that comes back to its beginning: to the same rest, which is then its last point too,
     or to the other.
     """
-    rows, ends = joined(start, ahead), ("closed", "closed")
+    rows, ends = concatenate(start, ahead), ("closed", "closed")
     if problem.symmetry == "brake" and (half := half_of_closed(rows)) is not None:
         rows, ends = half, ("branch point", "branch point")
     elif (
         np.sqrt(np.sum(METRIC * (ahead.point[-1] - start.point[0]) ** 2))
         < 2 * curve_of(rows).lengths[-1]
     ):
-        rows = joined(rows, start)
+        rows = concatenate(rows, start)
     return _family(problem, rows, curve_of(rows), ends)
 
 
-def _family(problem: Problem, rows: Corrected, curve: Curve, ends: tuple[str, str]) -> Family:
+def _family(problem: FamilyProblem, rows: Solved, curve: Curve, ends: tuple[str, str]) -> Family:
     arclength = np.concatenate([[0.0], np.cumsum(curve.lengths)])
     points = special_points(problem, rows, curve, arclength)
     status = Status.CONVERGED
@@ -445,8 +440,8 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) 
     half = float(base.rows.times[0].sum()) * PARTS[base.problem.symmetry] / 2
     duration = k * half * 2 / PARTS[symmetry]
     turns = base.problem.turns if symmetry != "brake" else (0.0, 0.0)
-    problem = Problem(pendulum, base.problem.natural, symmetry, turns)
-    point = laid_out(problem, *repeated(base.problem, base.rows, k), duration)
+    problem = FamilyProblem(pendulum, base.problem.natural, symmetry, turns)
+    point = guess_arc(problem, *repeated(base.problem, base.rows, k), duration)
     sides = []
     for sign in (1.0, -1.0):
         rows = problem.onto_branch(base.rows, point, sign)
@@ -464,15 +459,15 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) 
             )
         if problem.period(rows)[0] > reach.period:
             raise _too_short(reach)
-        start = begun(rows.point[0], rows.tangent[0], min(FIRST_STEP, reach.step), rows.steps[0])
+        start = start_at(rows.point[0], rows.tangent[0], min(FIRST_STEP, reach.step), rows.steps[0])
         ahead, end = problem.followed(start, rows, reach)
         if end == "closed":
             return _closed(problem, rows, ahead)
-        sides.append((joined(rows, ahead), end))
+        sides.append((concatenate(rows, ahead), end))
         if symmetry != "centred":
             break  # the other side holds the same orbits, at their other rest or in the mirror
     (one, end), other = sides[0], sides[1:]
     if other:
-        rows = joined(turned(other[0][0]), one)
+        rows = concatenate(reversed_(other[0][0]), one)
         return _family(problem, rows, curve_of(rows), (other[0][1], end))
     return _family(problem, one, curve_of(one), ("branch point", end))

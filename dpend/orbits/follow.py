@@ -13,19 +13,19 @@ import numpy as np
 
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum
-from dpend.orbits.arc import PARTS, SEGMENTS, UNKNOWNS, Arc, arc_of, laid
+from dpend.orbits.arc import PARTS, SEGMENTS, UNKNOWNS, Arc, arc_of, lay_arc
 from dpend.orbits.curve import (
     LEAVING,
     SAME_PLACE,
     Curve,
+    concatenate,
     curve_of,
     cut_at_return,
-    joined,
     release_and_time,
-    some_of,
+    select,
     way_to,
 )
-from dpend.orbits.newton import METRIC, Corrected, linearised, unpacked
+from dpend.orbits.newton import METRIC, Solved, linearise, unpack_table
 from dpend.orbits.walk import CHUNK, NEARLY, Tasks, Walk, walk
 
 # Resonances k:n are told, and followed, up to this k.
@@ -52,7 +52,7 @@ class Reach:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Problem:
+class FamilyProblem:
     """What is followed: the pendulum as it was given, which may carry derivatives, and the same in
     natural units.
     """
@@ -66,7 +66,7 @@ class Problem:
     def arc(self) -> Arc:
         return arc_of(self.symmetry, self.turns)
 
-    def corrected(self, points: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> Corrected:
+    def correct(self, points: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> Solved:
         """The points of the family in the planes through `points` that `rows` are normal to."""
         tables = []
         for first in range(0, len(points), CHUNK):
@@ -79,14 +79,12 @@ class Problem:
                 np.int64(count),
             )
             _, table, _, _ = walk(
-                self.natural, begun(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc
+                self.natural, start_at(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc
             )
             tables.append(np.asarray(table)[:count])
-        return unpacked(np.concatenate(tables))
+        return unpack_table(np.concatenate(tables))
 
-    def followed(
-        self, start: Walk, origin: Corrected | None, reach: Reach
-    ) -> tuple[Corrected, str]:
+    def followed(self, start: Walk, origin: Solved | None, reach: Reach) -> tuple[Solved, str]:
         """The points after `start`, and what the family's end is; `origin` is the place it could
         come back to.
         """
@@ -99,32 +97,32 @@ class Problem:
                 self.natural, start, np.float64(reach.step), tasks, self.arc
             )
             tables.append(np.asarray(table)[: int(more)])
-            rows, count = unpacked(np.concatenate(tables)), count + int(more)
+            rows, count = unpack_table(np.concatenate(tables)), count + int(more)
             end = ("", "ended", "lost")[int(status)]
             if end == "lost" and len(rows.point) and self._near_limit(rows):
                 end = "ended"
             (longer,) = np.nonzero(self.period(rows) > reach.period)
             if longer.size:
-                rows = some_of(rows, slice(longer[0] + 1))
+                rows = select(rows, slice(longer[0] + 1))
             back = None if origin is None else self._back(origin, rows, count - int(more))
             if back is not None:
                 return cut_at_return(rows, back)
             if longer.size:
                 return self._ending_at(reach.period, begin, rows), "longest period"
         if count > reach.points:
-            return some_of(rows, slice(reach.points)), "unfinished"
+            return select(rows, slice(reach.points)), "unfinished"
         if end == "ended":
             end = "homoclinic" if self._slows(rows) else "normal mode"
         return rows, end or "unfinished"
 
-    def period(self, rows: Corrected) -> np.ndarray:
+    def period(self, rows: Solved) -> np.ndarray:
         return np.asarray(PARTS[self.symmetry] * rows.times.sum(axis=1))
 
-    def _ending_at(self, period: float, begin: Walk, rows: Corrected) -> Corrected:
+    def _ending_at(self, period: float, begin: Walk, rows: Solved) -> Solved:
         """The rows, the last of which takes longer than `period`, with one of that period in its
         place; without, if the family was that long from its beginning.
         """
-        last = curve_of(some_of(rows, slice(-2, None)))
+        last = curve_of(select(rows, slice(-2, None)))
         if len(rows.point) == 1:
             points, tangents = (
                 np.vstack([begin.point, last.points]),
@@ -132,29 +130,29 @@ class Problem:
             )
             last = Curve(points, tangents, np.append(last.steps, last.steps))
         place, share = np.zeros(1, int), np.ones(1)
-        end = some_of(rows, slice(-1, None))
+        end = select(rows, slice(-1, None))
         for _ in range(_APPROACH):
             rate = end.time_slope / end.times.sum(axis=1) * last.lengths
             share = np.clip(share - np.log(self.period(end) / period) / rate, 0.0, 1.0)
             tangent = last.tangents_between(place, share)
-            end = self.corrected(last.between(place, share), METRIC * tangent, last.steps[1:])
+            end = self.correct(last.between(place, share), METRIC * tangent, last.steps[1:])
         found = end.converged[0] and abs(math.log(self.period(end)[0] / period)) < SAME_PLACE
-        return joined(some_of(rows, slice(-1)), end) if found else some_of(rows, slice(-1))
+        return concatenate(select(rows, slice(-1)), end) if found else select(rows, slice(-1))
 
-    def on_curve(self, point: np.ndarray) -> Corrected | None:
+    def on_curve(self, point: np.ndarray) -> Solved | None:
         """The point of the family near one that is nearly on it, its tangent not known; None if
         there is none.
         """
         row, steps = np.zeros(UNKNOWNS), np.array([_MANY_STEPS])
         row[[0, 1, -2]] = 0.6, 0.4, 1.0  # crosses any curve but by accident
         for _ in range(3):
-            rows = self.corrected(point[None], row[None], steps)
+            rows = self.correct(point[None], row[None], steps)
             if not rows.converged[0]:
                 return None
             point, row, steps = rows.point[0], METRIC * rows.tangent[0], rows.steps
         return rows
 
-    def onto_branch(self, base: Corrected, point: np.ndarray, sign: float) -> Corrected | None:
+    def onto_branch(self, base: Solved, point: np.ndarray, sign: float) -> Solved | None:
         """The first point of a branch that leaves the family of `base`, from that orbit's own point
         on this problem; None if nothing is met.
         """
@@ -164,7 +162,7 @@ class Problem:
             # here
         ):
             value, jacobian = (
-                np.asarray(x) for x in linearised(self.natural, point, _MANY_STEPS, self.arc)
+                np.asarray(x) for x in linearise(self.natural, point, _MANY_STEPS, self.arc)
             )
             point = point - np.linalg.pinv(jacobian, rcond=_NO_RANK) @ value
         _, sizes, directions = np.linalg.svd(jacobian)
@@ -181,7 +179,7 @@ class Problem:
         for size in _ONTO_BRANCH:
             steps = np.array([_MANY_STEPS])
             for _ in range(2):
-                rows = self.corrected((point + size * new)[None], (METRIC * new)[None], steps)
+                rows = self.correct((point + size * new)[None], (METRIC * new)[None], steps)
                 steps = rows.steps
             strayed = rows.point[0] - point - size * new
             if rows.converged[0] and np.sqrt(strayed @ (METRIC * strayed)) < _ASTRAY * size:
@@ -196,21 +194,21 @@ class Problem:
         upper, lower = float(1 + self.natural.m2), float(self.natural.m2 * self.natural.l2)
         return np.array([-upper - lower, lower - upper, upper - lower, upper + lower])
 
-    def _slows(self, rows: Corrected) -> bool:
+    def _slows(self, rows: Solved) -> bool:
         """Whether the time at the end grows like the logarithm of the distance from an
         equilibrium's energy.
         """
         gap = np.min(np.abs(rows.energy[-1] - self.levels))
         return bool(abs(rows.time_slope[-1]) * gap > 1e-3 * abs(rows.energy_slope[-1]))
 
-    def _near_limit(self, rows: Corrected) -> bool:
+    def _near_limit(self, rows: Solved) -> bool:
         """Whether a family was lost where rounding, magnified by the inverse distance, keeps it
         from its end.
         """
         gap = np.min(np.abs(rows.energy[-1] - self.levels[1:])) / self.levels[3]
         return bool(gap < NEARLY and abs(rows.energy_slope[-1]) < 1e3 * NEARLY * self.levels[3])
 
-    def _back(self, origin: Corrected, rows: Corrected, since: int) -> int | None:
+    def _back(self, origin: Solved, rows: Solved, since: int) -> int | None:
         """How many points it takes the curve to come back to `origin`, an orbit that it may meet at
         its other rest.
         """
@@ -237,7 +235,7 @@ class Problem:
         for _ in range(4):
             index, shares = np.array([i]), np.array([share])
             tangent = curve.tangents_between(index, shares)
-            rows = self.corrected(
+            rows = self.correct(
                 curve.between(index, shares), METRIC * tangent, curve.steps[index + 1]
             )
             apart = way_to(release_and_time(rows)[0], release)
@@ -250,7 +248,7 @@ class Problem:
 _APPROACH = 6
 
 
-def begun(point: np.ndarray, tangent: np.ndarray, step: Scalar, steps: Scalar) -> Walk:
+def start_at(point: np.ndarray, tangent: np.ndarray, step: Scalar, steps: Scalar) -> Walk:
     # Always of these types: compiled code is keyed by them.
     length, size, side = np.array([0.0, step, 0.0])
     count, leap = np.array([steps, 0]).astype(int)
@@ -262,8 +260,8 @@ def _padded(array: np.ndarray) -> np.ndarray:
     return np.concatenate([array, np.repeat(array[:1], missing, axis=0)])
 
 
-def laid_out(
-    problem: Problem, times: np.ndarray, states: np.ndarray, duration: float
+def guess_arc(
+    problem: FamilyProblem, times: np.ndarray, states: np.ndarray, duration: float
 ) -> np.ndarray:
     """A point to be corrected for an arc of `duration` on an orbit of which some states are
     known.
@@ -271,7 +269,7 @@ def laid_out(
     missing = _KNOWN - len(times)
     times = np.append(times, np.full(missing, np.inf))
     states = np.vstack([states, np.zeros((missing, 4))])
-    return np.asarray(laid(problem.natural, times, states, duration))
+    return np.asarray(lay_arc(problem.natural, times, states, duration))
 
 
 # Room for the known states of six periods of a centred orbit, so that the laying of arcs compiles
@@ -279,7 +277,7 @@ def laid_out(
 _KNOWN = 4 * SEGMENTS * LARGEST_COVER
 
 
-def _unrolled(problem: Problem, rows: Corrected) -> tuple[np.ndarray, np.ndarray]:
+def _unrolled(problem: FamilyProblem, rows: Solved) -> tuple[np.ndarray, np.ndarray]:
     """Times and states known on half a period of an orbit: its nodes and, if it is centred, their
     images about T/4.
     """
@@ -292,7 +290,7 @@ def _unrolled(problem: Problem, rows: Corrected) -> tuple[np.ndarray, np.ndarray
     return np.append(times, 2 * times[-1] - times[-2:0:-1]), np.vstack([states, centre, images])
 
 
-def repeated(problem: Problem, rows: Corrected, halves: int) -> tuple[np.ndarray, np.ndarray]:
+def repeated(problem: FamilyProblem, rows: Solved, halves: int) -> tuple[np.ndarray, np.ndarray]:
     """Times and states known on so many halves of an orbit's period."""
     times, states = _unrolled(problem, rows)
     half = rows.times[0].sum() * PARTS[problem.symmetry] / 2

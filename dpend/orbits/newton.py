@@ -1,58 +1,77 @@
-"""Newton's method for periodic orbits: in segments side by side, and in one piece on a line of
-releases.
+"""Newton's method for periodic orbits cut into segments.
+
+The equations of an arc (`shooting_equations`) are one fewer than the unknowns. A row and a value
+for row . point complete them: a plane through a predicted point of a family, or a release that is
+wanted.
 """
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, State, hamiltonian
-from dpend.motion.integrate import moved, step_size
 from dpend.orbits.arc import (
     LOG_DELTA,
-    METHOD,
     MOST_SEGMENT_STEPS,
     SEGMENTS,
     TURN,
-    UNFOLDING,
     UNKNOWNS,
     Arc,
     Equations,
     Factors,
-    arc_of,
-    arc_times,
-    end_conditions,
     shooting_equations,
     solve,
     solve_transposed,
-    stack_state,
 )
-from dpend.orbits.stability import stability_of, transition
 
 # Arclength: ds^2 is the mean over the nodes of dtheta1^2 + dtheta2^2, plus (d log Delta)^2.
 METRIC = np.concatenate([np.tile([1.0, 1.0, 0.0, 0.0], SEGMENTS) / SEGMENTS, [1.0, 0.0]])
-# Newton's update is then below rounding: its error is the square of this.
-_TOLERANCE = 1e-8
-# Where an orbit passes close by an equilibrium on its way, rounding is magnified by the inverse
-# square of the distance: below this an update that does not shrink is noise, and the error estimate
-# tells of it.
+# After an update of this size the next one, its square, is below rounding.
+TOLERANCE = 1e-8
+# An orbit that passes close by an equilibrium magnifies rounding by the inverse square of the
+# distance: below this size an update that does not shrink is noise, which the error estimate tells.
 _NOISE = 1e-6
-_MOST_ITERATIONS = 8
+# From a predicted point three or four iterations do; a point that takes more is tried nearer.
+MOST_ITERATIONS = 8
 # What rounding leaves of an equation, relative to the coordinates that it is made of: two units in
 # the last place, times the fourth root of m2/m1 where that is above 1.
 # Measured against long double (experiments/orbit_errors.py), which shows the quantiles of estimate
 # over error.
 _ROUNDINGS = 2.0 * float(np.finfo(np.float64).eps)
 
+# The covectors of theta1 and theta2 at the release.
+THETA1, THETA2 = np.eye(UNKNOWNS)[0], np.eye(UNKNOWNS)[1]
 
-class Corrected(NamedTuple):
+
+class Aim(NamedTuple):
+    """Which point of a family is sought: where row . point has the value it has at `predicted`.
+
+    Attributes:
+        predicted, row: the first iterate, and the normal of the plane through it.
+        steps: integration steps of a segment.
+        tolerance: for the last update that is made; the one after is its square.
+        amplitude: the unit of the nodes' updates, at most 1.
+        most_iterations: the estimate not counted.
+        fixed, asked: covectors: `angle_error` is what `asked` is known to where `fixed` is exact.
+    """
+
+    predicted: Any
+    row: Any
+    steps: Any
+    tolerance: Any = TOLERANCE
+    amplitude: Any = 1.0
+    most_iterations: Any = MOST_ITERATIONS
+    fixed: Any = THETA1
+    asked: Any = THETA2
+
+
+class Solved(NamedTuple):
     """A point on a family.
 
     Attributes:
@@ -63,9 +82,10 @@ class Corrected(NamedTuple):
         miss, contraction: the first Newton update, and the second over the first.
         steps: how many a segment should have been given.
         converged: whether Newton's method did.
-        angle_error: the change of the release on solving at half the step [rad].
-        theta2_error, time_error: of theta2 [rad] and of the time, relative, at this theta1: the
-            change on solving at half the step, and what rounding on the way makes of them.
+        release_change: the change of the release on solving at half the step [rad].
+        angle_error, time_error: of theta2 [rad] and of the time, relative, at this theta1 (or of
+            what else the aim asks): the change on solving at half the step, and what rounding on
+            the way makes of them.
         iterations: of Newton's method.
         residual: of the equations, the largest.
         end: the state at the arc's end.
@@ -82,8 +102,8 @@ class Corrected(NamedTuple):
     contraction: Any
     steps: Any
     converged: Any
+    release_change: Any
     angle_error: Any
-    theta2_error: Any
     time_error: Any
     iterations: Any
     residual: Any
@@ -95,7 +115,7 @@ class Corrected(NamedTuple):
     matrices: Any
 
 
-# How many numbers a `Corrected` is, and where each field is among them.
+# How many numbers a `Solved` is, and where each field is among them.
 _SHAPES = {
     "point": (UNKNOWNS,),
     "tangent": (UNKNOWNS,),
@@ -103,15 +123,15 @@ _SHAPES = {
     "times": (SEGMENTS,),
     "matrices": (SEGMENTS, 4, 4),
 }
-_SIZES = [math.prod(_SHAPES.get(name, ())) for name in Corrected._fields]
+_SIZES = [math.prod(_SHAPES.get(name, ())) for name in Solved._fields]
 ROW = sum(_SIZES)
 
 
-def unpacked(table: np.ndarray) -> Corrected:
-    """The rows of a table as one `Corrected` with a leading axis."""
+def unpack_table(table: np.ndarray) -> Solved:
+    """The rows of a table as one `Solved` with a leading axis."""
     columns = np.split(table, np.cumsum(_SIZES)[:-1], axis=1)
-    fields = zip(Corrected._fields, columns, strict=True)
-    return Corrected(*(column.reshape(-1, *_SHAPES.get(name, ())) for name, column in fields))
+    fields = zip(Solved._fields, columns, strict=True)
+    return Solved(*(column.reshape(-1, *_SHAPES.get(name, ())) for name, column in fields))
 
 
 class _Newton(NamedTuple):
@@ -143,113 +163,112 @@ def _rounding(pendulum: Pendulum, point: Array, arc: Arc) -> Array:
     return unit * jnp.concatenate([jnp.tile(sizes, SEGMENTS - 1), ends, none])
 
 
-def _errors(pendulum: Pendulum, n: _Newton, tangent: Array, time: Array, arc: Arc) -> Array:
-    """The errors of theta2 and of the log of the time, whose gradient is `time`, at the point's own
-    theta1.
+def _errors(
+    pendulum: Pendulum, n: _Newton, aim: Aim, tangent: Array, time: Array, arc: Arc
+) -> Array:
+    """The errors of the aim's `asked` and of the log of the time, whose gradient is `time`, at the
+    point's own value of `fixed`.
 
     The point is off the curve by the last update and by rounding, which the transposed equations
-    carry to what is asked. Where it is off in theta1, the curve's slope tells what the others are
-    off by; at a fold, where that is infinite, its curvature does.
+    carry to what is asked. Where `fixed` is off, the curve's slope tells what the others are off
+    by; at a fold, where that is infinite, its curvature does.
     """
-    wanted = jnp.stack([jnp.eye(UNKNOWNS)[0], jnp.eye(UNKNOWNS)[1], time])
+    wanted = jnp.stack([jnp.asarray(aim.fixed), jnp.asarray(aim.asked), time])
     pulled = solve_transposed(n.factors, wanted.T).T * _rounding(pendulum, n.point, arc)
-    off = jnp.sqrt(jnp.sum(pulled[0] ** 2))
-    slope = jnp.maximum(jnp.maximum(jnp.abs(tangent[0]), jnp.sqrt(off)), jnp.finfo(float).tiny)
-    along = (wanted[1:] @ tangent / slope * jnp.where(tangent[0] < 0, -1.0, 1.0))[:, None]
-    change = wanted[1:] @ n.update - along[:, 0] * n.update[0]
+    off, moving = jnp.sqrt(jnp.sum(pulled[0] ** 2)), wanted[0] @ tangent
+    slope = jnp.maximum(jnp.maximum(jnp.abs(moving), jnp.sqrt(off)), jnp.finfo(float).tiny)
+    along = (wanted[1:] @ tangent / slope * jnp.where(moving < 0, -1.0, 1.0))[:, None]
+    change = wanted[1:] @ n.update - along[:, 0] * (wanted[0] @ n.update)
     return jnp.abs(change) + jnp.sqrt(jnp.sum((pulled[1:] - along * pulled[:1]) ** 2, axis=1))
 
 
-def _units(pendulum: Pendulum) -> Array:
-    """What an update is measured in: radians, and the momenta that belong to the rate 1."""
+def _units(pendulum: Pendulum, amplitude: Scalar) -> Array:
+    """What an update is measured in: the amplitude, and the momenta that belong to as large a
+    rate.
+    """
     inertia = jnp.stack([1 + pendulum.m2, pendulum.m2 * pendulum.l2**1.5])
     nodes = jnp.tile(jnp.concatenate([jnp.ones(2), inertia]), SEGMENTS)
-    return jnp.append(nodes, jnp.ones(2))
+    return jnp.append(amplitude * nodes, jnp.ones(2))
 
 
-def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: Arc) -> Corrected:
-    """The point of the family in the plane through `predicted` that `row` is normal to, by Newton's
-    method.
+def _iterate(pendulum: Pendulum, aim: Aim, arc: Arc, n: _Newton) -> _Newton:
+    """One iteration; where `n.done` is 1, the estimate: the update at half the step, not made."""
+    estimating = n.done == 1
+    steps = jnp.where(estimating, 2 * aim.steps, aim.steps)
+    equations = shooting_equations(pendulum, n.point, steps, arc)
+    short = jnp.append(equations.value, aim.row @ (n.point - aim.predicted))
+    factors, pivots, order = lax.linalg.lu(jnp.concatenate([equations.jacobian, aim.row[None]]))
+    one = jnp.zeros(UNKNOWNS).at[-1].set(1.0)
+    update, null = solve((factors, order), jnp.stack([-short, one], axis=1)).T
+    swaps = jnp.sum(pivots != jnp.arange(UNKNOWNS, dtype=pivots.dtype)) % 2
+    size = jnp.max(jnp.abs(update) / _units(pendulum, aim.amplitude))
+    iterations = n.iterations + 1
+    noise = (n.iterations > 0) & (size <= _NOISE) & (size > 0.1 * n.size)
+    small = (size <= aim.tolerance) | noise
+    growing = (iterations > 1) & (size > n.size) & ~small
+    hopeless = ~(size < 2.0) | growing | (iterations >= aim.most_iterations)
+    return _Newton(
+        point=jnp.where(estimating, n.point, n.point + update),
+        iterations=iterations,
+        size=jnp.where(estimating, n.size, size),
+        first=jnp.where(n.iterations == 0, size, n.first),
+        contraction=jnp.where(iterations == 2, size / n.size, n.contraction),
+        done=jnp.where(estimating, 2, jnp.where(small, 1, jnp.where(hopeless, 3, 0))),
+        update=update,
+        null=null,
+        side=jnp.prod(jnp.sign(jnp.diagonal(factors))) * jnp.where(swaps == 0, 1.0, -1.0),
+        equations=equations,
+        factors=(factors, order),
+    )
+
+
+def correct(pendulum: Pendulum, aim: Aim, arc: Arc) -> Solved:
+    """The point of the family that `aim` tells of, by Newton's method.
 
     The last iteration takes half the step from where the others ended; its update, not made, is the
     error estimate.
     """
-    unit = _units(pendulum)
-
-    def iterate(n: _Newton) -> _Newton:
-        estimating = n.done == 1
-        equations = shooting_equations(
-            pendulum, n.point, jnp.where(estimating, 2 * steps, steps), arc
-        )
-        bordered = jnp.concatenate([equations.jacobian, row[None]])
-        short = jnp.append(equations.value, row @ (n.point - predicted))
-        factors, pivots, order = lax.linalg.lu(bordered)
-        one = jnp.zeros(UNKNOWNS).at[-1].set(1.0)
-        update, null = solve((factors, order), jnp.stack([-short, one], axis=1)).T
-        swaps = jnp.sum(pivots != jnp.arange(UNKNOWNS, dtype=pivots.dtype)) % 2
-        side = jnp.prod(jnp.sign(jnp.diagonal(factors))) * jnp.where(swaps == 0, 1.0, -1.0)
-        size = jnp.max(jnp.abs(update) / unit)
-        iterations = n.iterations + 1
-        contraction = jnp.where(iterations == 2, size / n.size, n.contraction)
-        small = (size <= _TOLERANCE) | (
-            (n.iterations > 0) & (size <= _NOISE) & (size > 0.1 * n.size)
-        )
-        hopeless = (
-            ~(size < 2.0)
-            | ((iterations > 1) & (size > n.size) & ~small)
-            | (iterations >= _MOST_ITERATIONS)
-        )
-        done = jnp.where(estimating, 2, jnp.where(small, 1, jnp.where(hopeless, 3, 0)))
-        return _Newton(
-            jnp.where(estimating, n.point, n.point + update),
-            iterations,
-            jnp.where(estimating, n.size, size),
-            jnp.where(n.iterations == 0, size, n.first),
-            contraction,
-            done,
-            update,
-            null,
-            side,
-            equations,
-            (factors, order),
-        )
+    zero = jnp.zeros(())
+    equations = jax.eval_shape(shooting_equations, pendulum, aim.predicted, aim.steps, arc)
+    start = _Newton(
+        point=aim.predicted,
+        iterations=jnp.asarray(0),
+        size=jnp.asarray(jnp.inf),
+        first=zero,
+        contraction=zero,
+        done=jnp.asarray(0),
+        update=aim.predicted,
+        null=aim.row,
+        side=zero,
+        equations=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), equations),
+        factors=(jnp.eye(UNKNOWNS), jnp.zeros(UNKNOWNS, jnp.int32)),
+    )
 
     def running(n: _Newton) -> Scalar:
         return n.done < 2
 
-    zero = jnp.zeros(())
-    blank = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(shooting_equations, pendulum, predicted, steps, arc),
+    return _solved(
+        pendulum,
+        lax.while_loop(running, lambda n: _iterate(pendulum, aim, arc, n), start),
+        aim,
+        arc,
     )
-    start = _Newton(
-        predicted,
-        jnp.asarray(0),
-        jnp.asarray(jnp.inf),
-        zero,
-        zero,
-        jnp.asarray(0),
-        predicted,
-        row,
-        zero,
-        blank,
-        (jnp.eye(UNKNOWNS), jnp.zeros(UNKNOWNS, jnp.int32)),
-    )
-    n = lax.while_loop(running, iterate, start)
+
+
+def _solved(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved:
+    """What is told of the point where Newton's method ended."""
     tangent = n.null / jnp.sqrt(n.null @ (METRIC * n.null))
     s = n.equations.segments
-
-    log_time = jnp.append(
-        s.stretch.ravel() / jnp.sum(s.time), jnp.array([1.0, 0.0])
-    )  # its gradient
-    theta2_error, time_error = _errors(pendulum, n, tangent, log_time, arc)
+    by_nodes = s.stretch.ravel() / jnp.sum(s.time)
+    log_time = jnp.append(by_nodes, jnp.array([1.0, 0.0]))  # its gradient
+    angle_error, time_error = _errors(pendulum, n, aim, tangent, log_time, arc)
 
     def energy(x: Array) -> Scalar:
         return hamiltonian(pendulum, State(*x))
 
     level, slope = jax.jvp(energy, (n.point[:4],), (tangent[:4],))
     wanted = jnp.ceil(jnp.nan_to_num(jnp.max(s.turn) / TURN, nan=1.0))
-    return Corrected(
+    return Solved(
         point=n.point,
         tangent=tangent,
         side=n.side,
@@ -257,8 +276,8 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
         contraction=n.contraction,
         steps=jnp.clip(wanted, 1, MOST_SEGMENT_STEPS).astype(int),
         converged=n.done == 2,
-        angle_error=jnp.max(jnp.abs(n.update[:2])),
-        theta2_error=theta2_error,
+        release_change=jnp.max(jnp.abs(n.update[:2])),
+        angle_error=angle_error,
         time_error=time_error,
         iterations=n.iterations,
         residual=jnp.max(jnp.abs(n.equations.value)),
@@ -271,65 +290,8 @@ def corrected(pendulum: Pendulum, predicted: Any, row: Any, steps: Scalar, arc: 
     )
 
 
-@partial(jax.jit, static_argnames="symmetry")
-def sensitivities(
-    ratios: Array, points: Array, rows: Array, steps: Array, turns: Array, symmetry: str
-) -> Float[Array, "m 9 3"]:
-    """Derivatives of what is known of orbits at row . point = target, by the implicit function
-    theorem.
-
-    Arguments:
-        ratios: l2/l1 and m2/m1.
-    Returns:
-        Of the first node, the angles at the end, the arc's time, kappa and log |kappa| (natural
-        units) with respect to the ratios and the target.
-    """
-
-    def one(task: tuple) -> Array:
-        point, row, count = task
-        return _sensitivity(ratios, point, row, count.astype(int), turns, symmetry)
-
-    return lax.map(one, (points, rows, steps))
-
-
-def _sensitivity(
-    ratios: Array, point: Array, row: Array, steps: Scalar, turns: Array, symmetry: str
-) -> Array:
-    arc = arc_of(symmetry, turns)
-
-    def ends(ratios: Array) -> Array:
-        here = Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0)
-        nodes = point[:LOG_DELTA].reshape(SEGMENTS, 4)
-        time, _ = arc_times(here, point)
-        end = stack_state(moved(METHOD, here, State(*nodes.T), step_size(time, steps), steps)).T
-        conditions, _ = end_conditions(here, nodes[0], end[-1], point[UNFOLDING], arc)
-        return jnp.concatenate([(end[:-1] - nodes[1:]).ravel(), conditions])
-
-    def known(both: Array) -> Array:
-        point, ratios = both[:-2], both[-2:]
-        here = Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0)
-        states = State(*point[:LOG_DELTA].reshape(SEGMENTS, 4).T)
-        times, _ = arc_times(here, point)
-        end, matrices = transition(here, states, step_size(times, steps), steps, METHOD)
-        _, kappa, logarithm = stability_of(jnp.moveaxis(matrices, -1, 0), symmetry, jnp)
-        last = jnp.stack([end.theta1[-1], end.theta2[-1], jnp.sum(times), kappa, logarithm])
-        return jnp.concatenate([point[:4], last])
-
-    jacobian = shooting_equations(
-        Pendulum(1.0, ratios[0], 1.0, ratios[1], 1.0), point, steps, arc
-    ).jacobian
-    by_ratios = jax.jacfwd(ends)(ratios)
-    right = jnp.zeros((UNKNOWNS, 3)).at[:-1, :2].set(-by_ratios).at[-1, 2].set(1.0)
-    moves = jnp.linalg.solve(jnp.concatenate([jacobian, row[None]]), right)
-    directions = jnp.concatenate([moves, jnp.eye(2, 3)]).T
-    both = jnp.append(point, ratios)
-    return jax.vmap(lambda direction: jax.jvp(known, (both,), (direction,))[1], out_axes=1)(
-        directions
-    )
-
-
 @jax.jit
-def linearised(pendulum: Pendulum, point: Array, steps: Scalar, arc: Arc) -> tuple[Array, Array]:
+def linearise(pendulum: Pendulum, point: Array, steps: Scalar, arc: Arc) -> tuple[Array, Array]:
     """The equations at a point, one fewer than unknowns, and their Jacobian."""
     equations = shooting_equations(pendulum, point, steps, arc)
     return equations.value, equations.jacobian

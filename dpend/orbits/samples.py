@@ -13,8 +13,8 @@ import numpy as np
 
 from dpend.checks import Scalar
 from dpend.orbits.curve import Curve
-from dpend.orbits.follow import LARGEST_COVER, Problem
-from dpend.orbits.newton import METRIC, Corrected
+from dpend.orbits.follow import LARGEST_COVER, FamilyProblem
+from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.orbit import PeriodicOrbit, Slopes
 from dpend.orbits.stability import LARGEST_C, growth_of, stability_of
 
@@ -23,8 +23,8 @@ from dpend.orbits.stability import LARGEST_C, growth_of, stability_of
 class Place:
     """A point of a curve, and what it solves."""
 
-    problem: "Problem"
-    rows: Corrected  # of one row
+    problem: "FamilyProblem"
+    rows: Solved  # of one row
 
 
 @jax.tree_util.register_dataclass
@@ -59,7 +59,7 @@ class Test(NamedTuple):
     """A function of the points that vanishes where something changes."""
 
     kind: str
-    value: Callable[[Corrected, np.ndarray], np.ndarray]
+    value: Callable[[Solved, np.ndarray], np.ndarray]
     branch: (
         tuple[str, int] | None
     )  # symmetry of the orbits that branch off, and their period in units of this one's
@@ -91,7 +91,7 @@ def test_functions(symmetry: str) -> list[Test]:
     return tests
 
 
-def measure_of(rows: Corrected, symmetry: str) -> np.ndarray:
+def measure_of(rows: Solved, symmetry: str) -> np.ndarray:
     """What the tests are told: c, or kappa of brake orbits."""
     c, kappa, _ = stability_of(rows.matrices, symmetry)
     return np.asarray(kappa if symmetry == "brake" else c)
@@ -103,9 +103,9 @@ def measure_of(rows: Corrected, symmetry: str) -> np.ndarray:
 _ROUNDING, _LEVERAGE, _WOBBLE = 2000 * np.finfo(float).eps, 4.0, 50.0
 
 
-def measure_error(rows: Corrected, symmetry: str) -> np.ndarray:
+def measure_error(rows: Solved, symmetry: str) -> np.ndarray:
     """What c, of brake orbits kappa, is known to."""
-    spread = np.maximum(rows.angle_error, rows.time_error)
+    spread = np.maximum(rows.release_change, rows.time_error)
     return np.asarray(
         growth_of(rows.matrices, symmetry) * np.maximum(_ROUNDING, _LEVERAGE * spread)
     )
@@ -124,18 +124,18 @@ def kappa_error(spot: "Spot", symmetry: str) -> float:
 
 
 def values_of_tests(
-    tests: Sequence[Test], problem: Problem, rows: Corrected
+    tests: Sequence[Test], problem: FamilyProblem, rows: Solved
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of each test at each point, shape (tests, points): the value, and what it is known to."""
     measure, error = measure_of(rows, problem.symmetry), measure_error(rows, problem.symmetry)
     eps = np.finfo(float).eps
-    wobble = _WOBBLE * np.maximum(np.maximum(rows.angle_error, rows.time_error), 10 * eps)
+    wobble = _WOBBLE * np.maximum(np.maximum(rows.release_change, rows.time_error), 10 * eps)
     errors = {"fold_theta1": wobble, "fold_energy": wobble * _steepness(problem, rows)}
     values = np.array([test.value(rows, measure) for test in tests])
     return values, np.array([errors.get(test.kind, error) for test in tests])
 
 
-def _steepness(problem: Problem, rows: Corrected) -> np.ndarray:
+def _steepness(problem: FamilyProblem, rows: Solved) -> np.ndarray:
     """The size of the energy's gradient at the release, which multiplies the tangent's error; a
     bound if it moves.
     """
@@ -149,18 +149,18 @@ class Samples(NamedTuple):
     """Points of a curve in order of arclength."""
 
     where: np.ndarray
-    rows: Corrected
+    rows: Solved
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """A curve on which points are solved for at any arclength."""
 
-    problem: Problem
+    problem: FamilyProblem
     curve: Curve
     arclength: np.ndarray
 
-    def rows_at(self, where: np.ndarray, near: Corrected | None = None) -> Corrected:
+    def rows_at(self, where: np.ndarray, near: Solved | None = None) -> Solved:
         """The points there: from the curve's cubics, or from points close by."""
         index = np.clip(
             np.searchsorted(self.arclength, where, side="right") - 1, 0, len(self.arclength) - 2
@@ -175,7 +175,7 @@ class Track:
                 normals * near.tangent, axis=1
             )
             points, steps = near.point + way[:, None] * near.tangent, near.steps
-        return self.problem.corrected(points, normals, steps)
+        return self.problem.correct(points, normals, steps)
 
 
 class Spot(NamedTuple):
@@ -186,6 +186,6 @@ class Spot(NamedTuple):
     kind: str
     where: float
     error: float
-    row: Corrected
+    row: Solved
     steepness: float
     branch: tuple[str, int] | None

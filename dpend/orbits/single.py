@@ -15,7 +15,6 @@ from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, State, fastest, normal_modes, released, vector_field
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import march, step_size
-from dpend.orbits.arc import PARTS
 from dpend.status import Status
 
 RK8 = Scheme("rk8", 1.0)  # only its method is used: the number of steps is settled orbit by orbit
@@ -255,8 +254,8 @@ def solve_twice(
     symmetry: str,
     settings: "Settings",
 ) -> tuple[LineNewton, Scalar, Array]:
-    """Newton's root from a close guess, the number of steps it used, and the change of (x, T) at
-    half the step.
+    """Newton's root from a close guess, the number of steps it used, and the change of (x, log T)
+    at half the step.
     """
     steps = steps_for(log_time, rate, settings.turn)
 
@@ -283,11 +282,8 @@ def solve_twice(
         # With the finer root's last update, too small to be made: a change below the tolerance
         # would read zero.
         x, log_time = both.x[1] + both.update[1, 0], both.log_time[1] + both.update[1, 1]
-        period = PARTS[symmetry] * jnp.exp(newton.log_time)
-        change = jnp.stack(
-            [jnp.abs(x - newton.x), period * jnp.abs(jnp.expm1(log_time - newton.log_time))]
-        )
-        change = change + _rounding(pendulum, line, newton.shot) * jnp.stack([1.0, period])
+        change = jnp.stack([jnp.abs(x - newton.x), jnp.abs(jnp.expm1(log_time - newton.log_time))])
+        change = change + _rounding(pendulum, line, newton.shot)
         change = jnp.where(both.status[1] == Status.CONVERGED, change, jnp.nan)
     return newton, steps, change
 
@@ -314,3 +310,13 @@ def rate_along(
     dt = step_size(jnp.exp(log_time), steps)
     end, rate = march(step, (state, fastest(pendulum, state)), dt, steps)
     return rate, jnp.stack([end.theta1, end.theta2])
+
+
+def residual_of(pendulum: Pendulum, newton: LineNewton, symmetry: str) -> Scalar:
+    """The largest equation: an angle [rad] if centred, else a momentum in units of
+    m2 l2 sqrt(g l2).
+    """
+    largest = jnp.max(jnp.abs(newton.shot.value))
+    return (
+        largest if symmetry == "centred" else largest * jnp.exp(newton.log_time) * clock(pendulum)
+    )

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from dpend.orbits.crossings import Zone, crossings, merged, outside, overlaps
-from dpend.orbits.curve import Curve, some_of
-from dpend.orbits.follow import Problem
-from dpend.orbits.newton import Corrected
+from dpend.orbits.curve import Curve, select
+from dpend.orbits.follow import FamilyProblem
+from dpend.orbits.newton import Solved
 from dpend.orbits.orbit import orbits_of, slopes_of
 from dpend.orbits.samples import (
     Place,
@@ -30,7 +30,7 @@ from dpend.orbits.walk import CROSSING
 
 
 def special_points(
-    problem: Problem, rows: Corrected, curve: Curve, arclength: np.ndarray
+    problem: FamilyProblem, rows: Solved, curve: Curve, arclength: np.ndarray
 ) -> list[SpecialPoint]:
     """Every place where another curve crosses, and every place where a test changes its sign by
     more than its error.
@@ -89,7 +89,7 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
         rows = track.rows_at(spots)
         more.append(Samples(spots, rows))
         for j, (function, place, height, sense) in enumerate(triples):
-            _narrow(place, height, spots[j], sense * function(some_of(rows, slice(j, j + 1)))[0])
+            _narrow(place, height, spots[j], sense * function(select(rows, slice(j, j + 1)))[0])
     return merged(samples, *more)
 
 
@@ -142,7 +142,7 @@ class _Change(NamedTuple):
     at_high: float
 
 
-def _changes(problem: Problem, samples: Samples) -> list[_Change]:
+def _changes(problem: FamilyProblem, samples: Samples) -> list[_Change]:
     tests = test_functions(problem.symmetry)
     changes = []
     for test, value, error in zip(
@@ -171,7 +171,7 @@ def _located(track: Track, changes: Sequence[_Change], zones: Sequence[Zone]) ->
     for i, (change, zone) in enumerate(zip(changes, across, strict=True)):
         if zone is None:
             j = solved.index(i)
-            place, error, row = float(where[j]), float(errors[j]), some_of(rows, slice(j, j + 1))
+            place, error, row = float(where[j]), float(errors[j]), select(rows, slice(j, j + 1))
             slope = float(slopes[j])
         else:
             width = change.high - change.low
@@ -191,14 +191,14 @@ _ROUNDS = 60
 
 
 def _own_values(
-    track: Track, changes: Sequence[_Change], rows: Corrected
+    track: Track, changes: Sequence[_Change], rows: Solved
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of each change its test at its own point: the value, and what it is known to."""
     values, errors = values_of_tests([change.test for change in changes], track.problem, rows)
     return np.diagonal(values).copy(), np.diagonal(errors).copy()
 
 
-def _roots(track: Track, changes: Sequence[_Change]) -> tuple[np.ndarray, Corrected]:
+def _roots(track: Track, changes: Sequence[_Change]) -> tuple[np.ndarray, Solved]:
     """Where the tests vanish, and the rows there.
 
     Newton's method on the family's equations together with the test's: each point is corrected onto
@@ -210,7 +210,7 @@ def _roots(track: Track, changes: Sequence[_Change]) -> tuple[np.ndarray, Correc
     )
     positive = at_low > 0
     going = np.arange(len(changes))
-    rows: Corrected | None = None
+    rows: Solved | None = None
     for _ in range(_ROUNDS):
         with np.errstate(invalid="ignore", over="ignore"):
             secant = (low * at_high - high * at_low) / (at_high - at_low)
@@ -221,11 +221,11 @@ def _roots(track: Track, changes: Sequence[_Change]) -> tuple[np.ndarray, Correc
         if rows is None:
             rows = track.rows_at(where)
         else:
-            new = track.rows_at(where[going], some_of(rows, going))
+            new = track.rows_at(where[going], select(rows, going))
             for column, part in zip(rows, new, strict=True):
                 column[going] = part
         mine = [changes[j] for j in going.tolist()]
-        value[going], error[going] = _own_values(track, mine, some_of(rows, going))
+        value[going], error[going] = _own_values(track, mine, select(rows, going))
         before = (value > 0) == positive
         # The weight of an end that stays for a second time is halved.
         after_high = np.where(before, np.where(last < 0, 0.5 * at_high, at_high), value)
@@ -251,7 +251,7 @@ _WIDER = 10.0
 
 
 def _location_errors(
-    track: Track, changes: Sequence[_Change], where: np.ndarray, rows: Corrected
+    track: Track, changes: Sequence[_Change], where: np.ndarray, rows: Solved
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far from a root its test's sign is certain, on both sides, by looking; and the slope of c
     between.
@@ -266,7 +266,7 @@ def _location_errors(
         certain, seen = np.ones(going.size, bool), []
         for side, end, sign in ((-1.0, low, np.sign(at_low)), (1.0, high, np.sign(at_high))):
             spot = np.clip(where[going] + side * width[going], low[going], high[going])
-            beside = track.rows_at(spot, some_of(rows, going))
+            beside = track.rows_at(spot, select(rows, going))
             value, noise = _own_values(track, mine, beside)
             certain &= (spot == end[going]) | (value * sign[going] > noise)
             seen.append((spot, measure_of(beside, track.problem.symmetry)))
@@ -287,7 +287,7 @@ def _told(
     spots: Sequence[Spot],
     crossings: Sequence[Spot],
     where: np.ndarray,
-    problem: Problem,
+    problem: FamilyProblem,
 ) -> list[Spot]:
     """The special points: what is too near to a crossing to be told from it is not, but for a
     change that lasts.
@@ -354,7 +354,7 @@ def _known_windows(bounds: list[Spot], where: np.ndarray, symmetry: str) -> list
     return kept
 
 
-def _special(problem: Problem, spot: Spot) -> SpecialPoint:
+def _special(problem: FamilyProblem, spot: Spot) -> SpecialPoint:
     both = orbits_of(problem, spot.row), slopes_of(problem, spot.row)
     orbit, slopes = jax.tree.map(lambda leaf: leaf[0], both)
     errors = spot.error, kappa_error(spot, problem.symmetry)

@@ -1,4 +1,8 @@
-"""The walk along a family: predictor, corrector and step control, compiled as one program."""
+"""The walk along a family: predictor, corrector and step control, compiled as one program.
+
+`take_step` is one step, or an attempt. Two loops run it: `walk` lists the points of a family, and
+`search` looks at each step for a release.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,7 +15,7 @@ from jaxtyping import Array
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, equilibria, momenta, normal_modes
 from dpend.orbits.arc import LOG_DELTA, SEGMENTS, Arc
-from dpend.orbits.newton import METRIC, ROW, Corrected, corrected
+from dpend.orbits.newton import METRIC, ROW, Aim, Solved, correct
 
 
 def hermite(start: Any, slope: Any, end: Any, end_slope: Any, length: Any, s: Any) -> Any:
@@ -42,6 +46,9 @@ _LARGEST_CONTRACTION, _SMALL = 0.05, 1e-5
 CROSSING, _LEAP = 2e-4, 0.01
 _LARGEST_LEAP_MISS = 0.3
 _SHORTEST_STEP = 1e-8
+# The cubic through two points is true to a few thousandths of its length: a root further away than
+# this share of it is another orbit.
+STRAYED = 0.1
 # Points in one call of the compiled walk.
 CHUNK = 32
 
@@ -63,7 +70,7 @@ class Walk(NamedTuple):
     leap: Any  # 1 if the next step is one, 2 after one that did not land
 
 
-def beginning(pendulum: Pendulum, slow: Scalar) -> Walk:
+def start_at_mode(pendulum: Pendulum, slow: Scalar) -> Walk:
     """A walk at zero amplitude, about to follow the slow or the fast normal mode (natural
     units).
     """
@@ -121,7 +128,7 @@ def walk(
     One program for both, and for all symmetries: it takes seconds to compile.
 
     Returns:
-        Where the walk stands, a table whose rows are `Corrected`, how many there are, and whether
+        Where the walk stands, a table whose rows are `Solved`, how many there are, and whether
         the family has ended (1), or no step is short enough (2).
     """
     given = tasks.number > 0
@@ -129,19 +136,11 @@ def walk(
 
     def advance(carry: tuple) -> tuple:
         w, table, count, _ = carry
-        ahead, along = _ahead(w)
-        new = corrected(
-            pendulum,
-            jnp.where(given, tasks.points[count], ahead),
-            jnp.where(given, tasks.rows[count], METRIC * along),
-            jnp.where(given, tasks.steps[count], w.steps),
-            arc,
-        )
+        task = Aim(tasks.points[count], tasks.rows[count], tasks.steps[count])
+        after, new, taken, status = take_step(pendulum, w, longest, arc, (given, task))
         row = jnp.concatenate([jnp.ravel(jnp.asarray(leaf, jnp.float64)) for leaf in new])
         table = table.at[count].set(row)  # a point taken back is overwritten by the next
-        after, taken, status = _judged(pendulum, w, new, longest)
-        after = jax.tree.map(partial(jnp.where, given), w, after)
-        return after, table, count + (taken | given).astype(int), jnp.where(given, 0, status)
+        return after, table, count + taken.astype(int), status
 
     def going(carry: tuple) -> Scalar:
         return (carry[2] < most) & (carry[3] == 0)
@@ -150,19 +149,30 @@ def walk(
     return lax.while_loop(going, advance, begin)
 
 
-def stride(
-    pendulum: Pendulum, w: Walk, longest: Scalar, arc: Arc
-) -> tuple[Walk, Corrected, Scalar, Scalar]:
-    """One step of a walk, or an attempt: where it stands then, the point, whether it was taken, and
-    the status that `walk` gives.
+def take_step(
+    pendulum: Pendulum, w: Walk, longest: Scalar, arc: Arc, task: tuple[Scalar, Aim]
+) -> tuple[Walk, Solved, Scalar, Scalar]:
+    """One step of a walk, or an attempt; or the correction of a task, which leaves the walk as it
+    is.
+
+    One corrector serves both: it takes seconds to compile.
+
+    Arguments:
+        task: whether there is one, and its aim.
+    Returns:
+        Where the walk stands then, the point, whether it was taken, and whether the family has
+        ended there (1) or no step is short enough (2).
     """
-    ahead, along = _ahead(w)
-    new = corrected(pendulum, ahead, METRIC * along, w.steps, arc)
-    after, taken, status = _judged(pendulum, w, new, longest)
-    return after, new, taken, status
+    given, aim = task
+    predicted, along = _predict(w)
+    here = Aim(predicted, METRIC * along, w.steps)
+    new = correct(pendulum, jax.tree.map(partial(jnp.where, given), aim, here), arc)
+    after, taken, status = _accept(pendulum, w, new, longest)
+    after = jax.tree.map(partial(jnp.where, given), w, after)
+    return after, new, taken | given, jnp.where(given, 0, status)
 
 
-def _ahead(w: Walk) -> tuple[Array, Array]:
+def _predict(w: Walk) -> tuple[Array, Array]:
     """The predicted point, by the cubic if it is not much longer than the last step, and the
     direction it lies in.
     """
@@ -178,8 +188,8 @@ def _amplitude(point: Array) -> Scalar:
     return jnp.max(jnp.abs(jnp.sin(point[:LOG_DELTA].reshape(SEGMENTS, 4)[:, :2])))
 
 
-def _judged(
-    pendulum: Pendulum, w: Walk, new: Corrected, longest: Scalar
+def _accept(
+    pendulum: Pendulum, w: Walk, new: Solved, longest: Scalar
 ) -> tuple[Walk, Scalar, Scalar]:
     """The walk after a step, whether that was taken or taken back, and how the family stands."""
     miss = new.miss / w.step
@@ -222,7 +232,7 @@ def _judged(
         straight=jnp.where(bent, w.straight, new.tangent),
         leap=jnp.where(w.step < 2 * CROSSING, w.leap, 0),
     )
-    close = jnp.where(new.angle_error > _BLURRED, NEARLY, HOMOCLINIC)
+    close = jnp.where(new.release_change > _BLURRED, NEARLY, HOMOCLINIC)
     homoclinic = jnp.any(jnp.abs(gaps[1:]) < close) & (
         jnp.abs(new.energy_slope) < 1e3 * close * unit
     )

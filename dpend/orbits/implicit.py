@@ -1,0 +1,200 @@
+"""The implicit function theorem: what is known of a root, as a function of its parameters.
+
+A root of F(root, parameters) = 0 moves by d root = -(dF/d root)^-1 (dF/d parameters) d parameters.
+One rule serves the equations of segments and those of shooting in one piece, for derivatives of any
+order. The parameters are l2/l1, m2/m1 and the value of what is held fixed at the release, in
+natural units.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dpend.checks import Scalar
+from dpend.mechanics.pendulum import Pendulum, State, hamiltonian, released
+from dpend.motion.integrate import moved, step_size
+from dpend.orbits.arc import (
+    LOG_DELTA,
+    METHOD,
+    SEGMENTS,
+    UNFOLDING,
+    arc_of,
+    arc_times,
+    end_conditions,
+    shooting_equations,
+    stack_state,
+)
+from dpend.orbits.newton import Solved
+from dpend.orbits.single import RK8
+from dpend.orbits.stability import stability_of, transition
+
+
+class Known(NamedTuple):
+    """What is known of an orbit, in natural units: the columns of an array that carries
+    derivatives.
+    """
+
+    theta1: Any
+    theta2: Any
+    p1: Any
+    p2: Any
+    end1: Any  # the angles at the arc's end
+    end2: Any
+    time: Any  # of the arc
+    energy: Any
+    kappa: Any
+    log_abs_kappa: Any
+
+
+class Equations(NamedTuple):
+    """The equations of a root, for the implicit function theorem.
+
+    Attributes:
+        symmetry: of the orbit.
+        linearise: (symmetry, root, parameters, given) -> dF/d root and dF/d parameters.
+        known: (symmetry, root, parameters, given) -> the columns of `Known`.
+    """
+
+    symmetry: str
+    linearise: Callable[..., tuple[Array, Array]]
+    known: Callable[..., Array]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def implicit(equations: Equations, values: Any, parameters: Array, given: Any) -> Any:
+    """`values`, a root and what is known of it, as a function of `parameters`, shape (3,).
+
+    The values were found before and come back as they are. Both Jacobians of the rule are taken
+    forwards and do not depend on the tangent, so that the rule can be transposed although the
+    flow's loop cannot.
+
+    Arguments:
+        given: an `ArcGiven` or `PieceGiven`: constants; as floats, since a rule's arguments need
+            tangents.
+    """
+    return values
+
+
+@implicit.defjvp
+def _implicit_jvp(equations: Equations, primals: tuple, tangents: tuple) -> tuple:
+    # By way of this rule, so that second derivatives know how the root moves.
+    root, known = implicit(equations, *primals)
+    _, parameters, given = primals
+    by_root, by_parameters = equations.linearise(equations.symmetry, root, parameters, given)
+    moves = -jnp.linalg.solve(by_root, by_parameters)
+
+    def along(move: Array, unit: Array) -> Array:
+        def again(root: Array, parameters: Array) -> Array:
+            return equations.known(equations.symmetry, root, parameters, given)
+
+        return jax.jvp(again, (root, parameters), (move, unit))[1]
+
+    slopes = jax.vmap(along, (1, 1), 1)(moves, jnp.eye(len(parameters)))
+    return (root, known), (moves @ tangents[1], slopes @ tangents[1])
+
+
+def _pendulum(parameters: Array) -> Pendulum:
+    return Pendulum(1.0, parameters[0], 1.0, parameters[1], 1.0)
+
+
+def parameters_of(pendulum: Pendulum, target: Scalar) -> Array:
+    """The parameters of a root: they carry the derivatives of the pendulum and of `target`."""
+    return jnp.stack(
+        jnp.broadcast_arrays(pendulum.l2 / pendulum.l1, pendulum.m2 / pendulum.m1, target), axis=-1
+    )
+
+
+class ArcGiven(NamedTuple):
+    """Of a root of segments: row . point is held at the target; steps of a segment; turns."""
+
+    row: Float[Array, " D"]
+    steps: Scalar
+    turns: Float[Array, "2"]
+
+
+def _linearise_arc(
+    symmetry: str, point: Array, parameters: Array, given: ArcGiven
+) -> tuple[Array, Array]:
+    arc, steps = arc_of(symmetry, given.turns), given.steps.astype(int)
+    jacobian = shooting_equations(_pendulum(parameters), point, steps, arc).jacobian
+
+    def closings(parameters: Array) -> Array:
+        here, nodes = _pendulum(parameters), point[:LOG_DELTA].reshape(SEGMENTS, 4)
+        time, _ = arc_times(here, point)
+        end = stack_state(moved(METHOD, here, State(*nodes.T), step_size(time, steps), steps)).T
+        conditions, _ = end_conditions(here, nodes[0], end[-1], point[UNFOLDING], arc)
+        border = given.row @ point - parameters[2]
+        return jnp.concatenate([(end[:-1] - nodes[1:]).ravel(), conditions, border[None]])
+
+    return jnp.concatenate([jacobian, given.row[None]]), jax.jacfwd(closings)(parameters)
+
+
+def _know_arc(symmetry: str, point: Array, parameters: Array, given: ArcGiven) -> Array:
+    here, steps = _pendulum(parameters), given.steps.astype(int)
+    nodes = State(*point[:LOG_DELTA].reshape(SEGMENTS, 4).T)
+    times, _ = arc_times(here, point)
+    end, matrices = transition(here, nodes, step_size(times, steps), steps, METHOD)
+    stability = stability_of(jnp.moveaxis(matrices, -1, 0), symmetry, jnp)[1:]
+    energy = hamiltonian(here, State(*point[:4]))
+    rest = [end.theta1[-1], end.theta2[-1], jnp.sum(times), energy, *stability]
+    return jnp.concatenate([point[:4], jnp.stack(rest)])
+
+
+def arc_equations(symmetry: str) -> Equations:
+    """The equations of an orbit in segments."""
+    return Equations(symmetry, _linearise_arc, _know_arc)
+
+
+def know_solved(rows: Solved, symmetry: str, xp: Any) -> Any:
+    """The columns of `Known` for points on a family, shape (..., 10), in NumPy or JAX.
+
+    But for `odd` orbits the start is at rest, exactly.
+    """
+    _, kappa, logarithm = stability_of(rows.matrices, symmetry, xp)
+    start = rows.point[..., :4] * xp.asarray([1.0, 1.0, *(2 * [float(symmetry == "odd")])])
+    rest = [rows.times.sum(axis=-1), rows.energy, kappa, logarithm]
+    return xp.concatenate([start, rows.end[..., :2], xp.stack(rest, axis=-1)], axis=-1)
+
+
+class PieceGiven(NamedTuple):
+    """Of a root (x, log of the shooting time) in one piece: the release is target * origin +
+    x * direction; steps of the piece.
+    """
+
+    origin: Float[Array, "2"]
+    direction: Float[Array, "2"]
+    steps: Scalar
+
+
+def _linearise_piece(
+    symmetry: str, root: Array, parameters: Array, given: PieceGiven
+) -> tuple[Array, Array]:
+    steps = given.steps.astype(int)
+
+    def ends(both: Array) -> Array:
+        start = released(*(both[4] * given.origin + both[0] * given.direction))
+        end = moved(RK8, _pendulum(both[2:]), start, step_size(jnp.exp(both[1]), steps), steps)
+        # Momenta without their unit: at a root the factor does not matter.
+        return jnp.stack([end.theta1, end.theta2] if symmetry == "centred" else [end.p1, end.p2])
+
+    jacobian = jax.jacfwd(ends)(jnp.concatenate([root, parameters]))
+    return jacobian[:, :2], jacobian[:, 2:]
+
+
+def know_piece(symmetry: str, root: Array, parameters: Array, given: PieceGiven) -> Array:
+    """The columns of `Known` for an orbit in one piece."""
+    here, steps, time = _pendulum(parameters), given.steps.astype(int), jnp.exp(root[1])
+    start = released(*(parameters[2] * given.origin + root[0] * given.direction))
+    end, matrix = transition(here, start, step_size(time, steps), steps, RK8)
+    stability = stability_of(matrix[None], symmetry, jnp)[1:]
+    at_end = [end.theta1, end.theta2, time, hamiltonian(here, start), *stability]
+    return jnp.stack([*jax.tree.leaves(start), *at_end])
+
+
+def piece_equations(symmetry: str) -> Equations:
+    """The equations of an orbit in one piece."""
+    return Equations(symmetry, _linearise_piece, know_piece)
