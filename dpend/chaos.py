@@ -46,7 +46,7 @@ class _Count(NamedTuple):
 _NONE = _Count(np.float64(0.0), np.float64(0.0))
 
 
-def _grown(
+def _grow(
     count: _Count, time: Scalar, dt: Scalar, state: State, tangent: State
 ) -> tuple[_Count, State]:
     """The `update` that follows one tangent over any length of time."""
@@ -61,7 +61,7 @@ def _log(norm: Norm, tangent: State, count: _Count) -> Scalar:
     return 0.5 * jnp.log(norm.square(tangent)) - math.log(_SCALE_BACK) * count.turns
 
 
-def _at_the_door(compiled: Callable[..., dict[str, Scalar]]) -> Callable[..., dict[str, Scalar]]:
+def _behind_checks(compiled: Callable[..., dict[str, Scalar]]) -> Callable[..., dict[str, Scalar]]:
     """A compiled quantity behind the checks of its arguments, which `jit` would refuse in words of
     its own.
     """
@@ -79,7 +79,7 @@ def _at_the_door(compiled: Callable[..., dict[str, Scalar]]) -> Callable[..., di
     return quantity
 
 
-@_at_the_door
+@_behind_checks
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def lyapunov(
     pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float
@@ -101,12 +101,12 @@ def lyapunov(
 
     size = norm(pendulum)
     count, tangent = fold(
-        _grown, _NONE, pendulum, state, duration, scheme, tangents=size.vector(*GENERIC)
+        _grow, _NONE, pendulum, state, duration, scheme, tangents=size.vector(*GENERIC)
     )
     return {"lyapunov": _log(size, tangent, count) / duration, "steps": count.steps.astype(int)}
 
 
-@_at_the_door
+@_behind_checks
 @partial(jax.jit, static_argnames=("scheme", "duration", "windows"))
 def maximal_lyapunov(
     pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float, windows: int = 20
@@ -140,7 +140,7 @@ def maximal_lyapunov(
     ) -> tuple[tuple[State, State, Scalar], Scalar]:
         state, tangent, steps = carry
         both = fold(
-            _followed, (state, _NONE), pendulum, state, duration / windows, scheme, tangents=tangent
+            _follow, (state, _NONE), pendulum, state, duration / windows, scheme, tangents=tangent
         )
         (end, count), tangent = both
         length = jnp.sqrt(size.square(tangent))
@@ -161,15 +161,17 @@ def maximal_lyapunov(
     }
 
 
-def _followed(both, time, dt, state, tangent):  # type: ignore[no-untyped-def]
+def _follow(
+    both: tuple[State, _Count], time: Scalar, dt: Scalar, state: State, tangent: State
+) -> tuple[tuple[State, _Count], State]:
     """The `update` that follows one tangent and keeps the state, so that the motion can go on from
     there.
     """
-    count, tangent = _grown(both[1], time, dt, state, tangent)
+    count, tangent = _grow(both[1], time, dt, state, tangent)
     return (state, count), tangent
 
 
-@_at_the_door
+@_behind_checks
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def spectrum(
     pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float
@@ -199,7 +201,7 @@ def spectrum(
         length = jnp.sqrt(row @ row)
         return rows.at[index].set(row / length), lengths.at[index].set(length)
 
-    def update(carry, time, dt, state, tangents):  # type: ignore[no-untyped-def]
+    def update(carry: Any, time: Scalar, dt: Scalar, state: State, tangents: State) -> Any:
         logs, steps = carry
         rows = jnp.stack(
             [
@@ -227,7 +229,7 @@ def spectrum(
     return {f"exponent{i + 1}": logs[i] / duration for i in range(4)} | {"steps": steps.astype(int)}
 
 
-@_at_the_door
+@_behind_checks
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def megno(
     pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float
@@ -250,7 +252,7 @@ def megno(
     duration = float(number("duration", duration, positive=True, unit="s"))
     size = norm(pendulum)
 
-    def update(carry, time, dt, state, tangent):  # type: ignore[no-untyped-def]
+    def update(carry: Any, time: Scalar, dt: Scalar, state: State, tangent: State) -> Any:
         weighted, mean, before, steps = carry
         square = size.square(tangent)
         weighted = weighted + (time - 0.5 * dt) * jnp.log(square / before)
@@ -283,7 +285,7 @@ def _upright(pendulum: Pendulum, state: State) -> tuple[Scalar, Scalar]:
     return wave(state.theta1), wave(state.theta2)
 
 
-@_at_the_door
+@_behind_checks
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def flip(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -> dict[str, Scalar]:
     """When a bob first goes over the top: the first t > 0 at which cos(theta1/2) or cos(theta2/2)
@@ -309,7 +311,7 @@ def flip(pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float) -
     return {"flip_time": time, "bob": crossing.which + 1, "steps": crossing.steps.astype(int)}
 
 
-@_at_the_door
+@_behind_checks
 @partial(jax.jit, static_argnames=("scheme", "duration"))
 def drift(
     pendulum: Pendulum, state: State, scheme: Scheme, *, duration: float
@@ -328,7 +330,7 @@ def drift(
     """
     start = hamiltonian(pendulum, state)
 
-    def update(carry, time, dt, state):  # type: ignore[no-untyped-def]
+    def update(carry: Any, time: Scalar, dt: Scalar, state: State) -> Any:
         # NaN stays NaN: a motion that was lost has no drift.
         return jnp.maximum(carry[0], jnp.abs(hamiltonian(pendulum, state) - start)), carry[1] + 1.0
 

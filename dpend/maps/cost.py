@@ -81,12 +81,12 @@ def _shortening(task: Task) -> float:
     cells = {
         key: mesh.ravel() for key, mesh in zip(task.grid.axes, np.meshgrid(*ends), strict=True)
     }
-    shorter = np.asarray(_cut(task.scheme, *task.shared, cells))
+    shorter = np.asarray(_shorten_at_start(task.scheme, *task.shared, cells))
     return float(np.max(shorter[shorter < _LOST], initial=1.0))
 
 
 @partial(jax.jit, static_argnums=0)
-def _cut(
+def _shorten_at_start(
     scheme: Scheme, pendulum: Pendulum, at: dict[str, Scalar], cells: dict[str, Scalar]
 ) -> Scalar:
     def one(cell: dict[str, Scalar]) -> Scalar:

@@ -151,7 +151,7 @@ class Grid:
         mirrored = all(np.array_equal(array, -array[::-1]) for array in moving)
         return bool(moving) and mirrored and not any(self.at.values())
 
-    def reflected(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
+    def reflect(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
         """The block of mirror images of a block of cells."""
         return tuple(
             slice(size - part.stop, size - part.start) if key in STATE else part

@@ -71,7 +71,7 @@ def launches(
     kinds = _kinds(function, jax.tree.structure(shared), structure)
     devices = tuple(jax.local_devices())
     if devices[0].platform != "cpu":
-        yield _collected(np.asarray(_vmapped(function, shared, structure, table)), kinds)
+        yield _collect(np.asarray(_vmapped(function, shared, structure, table)), kinds)
         return
     mesh = Mesh(np.array(devices), ("devices",))
     blocks = max(1, _BLOCKS * _FEW_NUMBERS // max(_FEW_NUMBERS, _rows(kinds)))
@@ -83,9 +83,9 @@ def launches(
         rows = _blocks(function, structure, mesh, shared, *_dealt(piece, mesh, blocks))
         under_way.append((rows, piece.shape[1]))
         if len(under_way) == _UNDER_WAY:
-            yield _gathered(*under_way.popleft(), kinds)
+            yield _gather(*under_way.popleft(), kinds)
     while under_way:
-        yield _gathered(*under_way.popleft(), kinds)
+        yield _gather(*under_way.popleft(), kinds)
 
 
 def _dealt(piece: np.ndarray, mesh: Mesh, blocks: int) -> tuple[Any, Any]:
@@ -102,17 +102,17 @@ def _dealt(piece: np.ndarray, mesh: Mesh, blocks: int) -> tuple[Any, Any]:
     return jax.device_put(hands, place), jax.device_put(counts, place)
 
 
-def _gathered(rows: jax.Array, lanes: int, kinds: Any) -> Any:
+def _gather(rows: jax.Array, lanes: int, kinds: Any) -> Any:
     shards = sorted(rows.addressable_shards, key=lambda shard: shard.index[0].start)
     used = -(-lanes // (len(shards) * WIDTH))
     hands = np.stack(
         [np.asarray(shard.data)[0, :used] for shard in shards]
     )  # devices, blocks, values, width
     table = hands.transpose(2, 1, 0, 3)
-    return _collected(table.reshape(table.shape[0], -1)[:, :lanes], kinds)
+    return _collect(table.reshape(table.shape[0], -1)[:, :lanes], kinds)
 
 
-def _collected(table: np.ndarray, kinds: Any) -> Any:
+def _collect(table: np.ndarray, kinds: Any) -> Any:
     """The table's rows as the tree that the function gives, each of its own kind."""
     leaves, structure = jax.tree.flatten(kinds)
     parts = np.split(table, np.cumsum([math.prod(kind.shape) for kind in leaves])[:-1])

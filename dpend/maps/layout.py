@@ -20,7 +20,7 @@ def store_of(work: Work, path: Path, attributes: dict[str, Any]) -> Store:
     """What the store of a sweep should hold."""
     memory: dict[str, Any] = {}  # the files of an empty store, as Zarr writes them
     arrays = _lay(work, attributes, memory)
-    files = _consolidated({name: buffer.to_bytes() for name, buffer in memory.items()})
+    files = _consolidate({name: buffer.to_bytes() for name, buffer in memory.items()})
 
     def encode(name: str, block: tuple[slice, ...], values: np.ndarray) -> bytes:
         arrays[name.partition("/")[0]][block] = values
@@ -83,7 +83,7 @@ def _lay(work: Work, attributes: dict[str, Any], memory: dict[str, Any]) -> dict
     }
 
 
-def _consolidated(files: dict[str, bytes]) -> dict[str, bytes]:
+def _consolidate(files: dict[str, bytes]) -> dict[str, bytes]:
     """The files with the metadata of all arrays in the group's too, where xarray looks for it
     first.
     """

@@ -107,25 +107,25 @@ class Store:
 
     def inspect(self) -> "Findings":
         """Every file beside what it should be, one tile at a time."""
-        stale = {}
-        for name, text in self.documents.items():
-            if problem := self._document_problem(name, text):
-                stale[name] = problem
-        for name, text in self.coordinates.items():
-            if problem := self._coordinate_problem(name, text):
-                stale[name] = problem
+        stale = self._find_stale()
         tiles = {tile: self._tile_problems(tile) for tile in self.tiles}
         todo = [tile for tile in self.tiles if tiles[tile]]
         # Tiles are computed in order: one that was never done has no digest, and none after it has.
         done = sum(1 for _ in itertools.dropwhile(tiles.get, reversed(self.tiles)))
         before = set(self.tiles[:done])
-        again = [
-            tile
-            for tile in todo
-            if tile in before or tiles[tile].get(self._digest_name(tile)) != MISSING
-        ]
+        fresh = {tile for tile in todo if tiles[tile].get(self._digest_name(tile)) == MISSING}
+        again = [tile for tile in todo if tile in before or tile not in fresh]
         damage = stale | {name: why for tile in again for name, why in tiles[tile].items()}
         return Findings(stale, todo, again, damage, list(self.path.glob("*.partial")))
+
+    def _find_stale(self) -> dict[str, str]:
+        """Metadata and coordinates that are not as they should be, and why."""
+        problems = {
+            name: self._document_problem(name, self.documents[name]) for name in self.documents
+        }
+        for name, text in self.coordinates.items():
+            problems[name] = self._coordinate_problem(name, text)
+        return {name: problem for name, problem in problems.items() if problem}
 
     def _document_problem(self, name: str, text: bytes) -> str:
         try:

@@ -106,29 +106,13 @@ def sweep(
     work = Work(Task(keyed, grid, scheme, error is not None, mirror), most)
     work.tell, work.announce = progress, announce
     if place is None:
-        return _labelled(work.task, compute(work), work.task.attributes(name, strict=False))
+        return _label(work.task, compute(work), work.task.attributes(name, strict=False))
     return compute_in_store(work, place, work.task.attributes(name, strict=True))
 
 
 def _scheme(grid: Grid, tolerance: Any, method: Any, step: Any) -> Scheme:
     if method is None and step is None:
-        wanted = known_number(
-            "tolerance", _TOLERANCE if tolerance is None else tolerance, positive=True, unit="rad"
-        )
-        ends = {
-            key: (array.min(), array.max()) for key, array in grid.axes.items() if key in PENDULUM
-        }
-        corners = np.array(np.meshgrid(*ends.values())).reshape(len(ends), -1).T if ends else [()]
-        pendulums = [
-            replace(grid.pendulum, **dict(zip(ends, map(float, corner), strict=True)))
-            for corner in corners
-        ]
-        # Without gravity nothing sets a time: the others do, as they do where zero lies between the
-        # ends.
-        schemes = [
-            scheme_for(one, wanted) for one in [one for one in pendulums if one.g] or pendulums
-        ]
-        return min(schemes, key=lambda scheme: scheme.step)  # the fastest pendulum's
+        return _scheme_for_all(grid, _TOLERANCE if tolerance is None else tolerance)
     if tolerance is not None:
         raise ValueError(f"tolerance excludes method and step, got {shown(tolerance)}: give either")
     if method is None or step is None:
@@ -137,6 +121,21 @@ def _scheme(grid: Grid, tolerance: Any, method: Any, step: Any) -> Scheme:
             f"{missing} must be given with {given}, got {given} alone: or give a tolerance"
         )
     return Scheme(method, step)
+
+
+def _scheme_for_all(grid: Grid, tolerance: Any) -> Scheme:
+    """The scheme that reaches a tolerance at every corner of the axes."""
+    wanted = known_number("tolerance", tolerance, positive=True, unit="rad")
+    ends = {key: (array.min(), array.max()) for key, array in grid.axes.items() if key in PENDULUM}
+    corners = np.array(np.meshgrid(*ends.values())).reshape(len(ends), -1).T if ends else [()]
+    pendulums = [
+        replace(grid.pendulum, **dict(zip(ends, map(float, corner), strict=True)))
+        for corner in corners
+    ]
+    # Without gravity nothing sets a time: the others do, as they do where zero lies between the
+    # ends.
+    schemes = [scheme_for(one, wanted) for one in [one for one in pendulums if one.g] or pendulums]
+    return min(schemes, key=lambda scheme: scheme.step)  # the fastest pendulum's
 
 
 def compute(work: Work) -> dict[str, np.ndarray]:
@@ -170,7 +169,7 @@ def _check_memory(size: int) -> None:
         )
 
 
-def _labelled(task: Task, values: dict[str, np.ndarray], attributes: dict[str, Any]) -> Any:
+def _label(task: Task, values: dict[str, np.ndarray], attributes: dict[str, Any]) -> Any:
     import xarray
 
     dims = tuple(task.grid.axes)

@@ -20,7 +20,7 @@ _SAMPLES = 64
 class Work:
     """A sweep under way: what it may cost, and how far it is."""
 
-    def __init__(self, task: Task, most_steps: float):
+    def __init__(self, task: Task, most_steps: float) -> None:
         self.task, self.most_steps = task, most_steps
         self.tell: Callable[[int, int, int], None] | None = None
         self.announce: Callable[[Cost], None] | None = None
@@ -114,7 +114,7 @@ def _tile_values(
     shape = tuple(part.stop - part.start for part in block)
     if parities is None:
         return _lane_values(work, block, np.ones(shape, bool))
-    known = {key: grid.flip(array) for key, array in done(grid.reflected(block)).items()}
+    known = {key: grid.flip(array) for key, array in done(grid.reflect(block)).items()}
     fresh = known["status"] == Status.NOT_COMPUTED
     places = np.meshgrid(*(np.arange(part.start, part.stop) for part in block), indexing="ij")
     images = [

@@ -23,7 +23,7 @@ from dpend.methods.runge_kutta import (
     Step,
     Tableau,
     add_compensated,
-    displaced,
+    displace,
     for_each_tangent,
 )
 
@@ -109,7 +109,7 @@ def _gauss_slopes(pendulum: Pendulum, dt: Scalar, state: State) -> tuple[State, 
     return jax.tree.map(lambda leaf: jnp.where(end.size <= _NEARLY, leaf, jnp.nan), end.slopes)
 
 
-def _weighted(dt: Scalar, slopes: Sequence[State]) -> list[State]:
+def _weigh(dt: Scalar, slopes: Sequence[State]) -> list[State]:
     """dt b_j k_j of every stage."""
     return [
         jax.tree.map(partial(jnp.multiply, dt * b), slope)
@@ -120,8 +120,8 @@ def _weighted(dt: Scalar, slopes: Sequence[State]) -> list[State]:
 def _at_stages(
     pendulum: Pendulum, dt: Scalar, state: State, slopes: tuple[State, ...]
 ) -> tuple[State, ...]:
-    steps = _weighted(dt, slopes)
-    return tuple(vector_field(pendulum, displaced(state, row, steps)) for row in _SHARES)
+    steps = _weigh(dt, slopes)
+    return tuple(vector_field(pendulum, displace(state, row, steps)) for row in _SHARES)
 
 
 # Leaves alone: the linear system of its derivative is one of flat vectors.
@@ -165,7 +165,7 @@ class _SummedForm(Form):
         leaves = _gauss_leaves(jax.tree.leaves(pendulum), dt, jax.tree.leaves(point.state))
         slopes = [State(*leaves[i : i + 4]) for i in (0, 4, 8)]
         return _Summed(
-            *add_compensated(point.state, displaced(point.rest, (1.0,) * 3, _weighted(dt, slopes)))
+            *add_compensated(point.state, displace(point.rest, (1.0,) * 3, _weigh(dt, slopes)))
         )
 
     def move_compensated(

@@ -149,8 +149,8 @@ def explicit_step(
     if written_out:
         slopes: list[Point] = []
         for row in tableau.a:
-            slopes.append(increment(displaced(point, row, slopes)))
-        return displaced(base, tableau.b, slopes)
+            slopes.append(increment(displace(point, row, slopes)))
+        return displace(base, tableau.b, slopes)
     # Rows, one for each number that a leaf holds for each lane, so that a stage is one pass over
     # contiguous lanes.
     leaves, structure = jax.tree.flatten(point)
@@ -182,7 +182,7 @@ def explicit_step(
     )
 
 
-def displaced(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Point:
+def displace(point: Point, row: tuple[float, ...], slopes: list[Point]) -> Point:
     """point + sum_j row_j slopes_j, without the terms whose weight is zero."""
     used = [(weight, slope) for weight, slope in zip(row, slopes, strict=True) if weight != 0.0]
     if not used:

@@ -4,7 +4,7 @@ included; and the step that reaches a tolerance (`find_scheme`).
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +80,9 @@ class Comparison(NamedTuple):
     end: State  # the motion's own last state, its turns taken off
 
 
-def compare_motions(pendulum, state, dt, steps, scheme):  # type: ignore[no-untyped-def]
+def compare_motions(
+    pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar, scheme: Scheme
+) -> Comparison:
     """What second passes tell of a motion: one pass, or `_PASSES` of them where rounding may be
     what they see.
 
@@ -88,16 +90,17 @@ def compare_motions(pendulum, state, dt, steps, scheme):  # type: ignore[no-unty
     many will not.
     """
 
-    def goes(carried):  # type: ignore[no-untyped-def]
-        count, seen = carried
+    def goes(work: tuple[Scalar, Comparison]) -> Scalar:
+        count, seen = work
         return (count < 1) | ((count < _PASSES) & (seen.estimate < _SEEN * seen.floor))
 
-    def again(carried):  # type: ignore[no-untyped-def]
-        count, before = carried
+    def again(work: tuple[Scalar, Comparison]) -> tuple[Scalar, Comparison]:
+        count, before = work
         seen = _one_comparison(pendulum, state, dt, steps, scheme, jnp.asarray(_AWAY)[count])
         return count + 1, seen._replace(estimate=jnp.maximum(before.estimate, seen.estimate))
 
-    return lax.while_loop(goes, again, (0, comparison_of(0.0)))[1]
+    seen: Comparison = lax.while_loop(goes, again, (0, comparison_of(0.0)))[1]
+    return seen
 
 
 def comparison_of(value: float) -> Comparison:
@@ -106,7 +109,9 @@ def comparison_of(value: float) -> Comparison:
     return Comparison(*numbers, State(*numbers))
 
 
-def _one_comparison(pendulum, state, dt, steps, scheme, away):  # type: ignore[no-untyped-def]
+def _one_comparison(
+    pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar, scheme: Scheme, away: Scalar
+) -> Comparison:
     """A motion beside one of half the step whose sums are compensated, and what its start's
     rounding grows to.
 
@@ -123,7 +128,7 @@ def _one_comparison(pendulum, state, dt, steps, scheme, away):  # type: ignore[n
     state, turns = without_turns(state)
     start, energy = scheme.enter(pendulum, state), hamiltonian(pendulum, state)
 
-    def step(carry, time, dt):  # type: ignore[no-untyped-def]
+    def step(carry: Any, time: Scalar, dt: Scalar) -> Any:
         coarse, along, fine, rest, (worst, growth, rate, drift) = carry
         if scheme.name == _GUIDE:
             coarse, tangents = scheme.move_tangents(whole, coarse, along)
@@ -146,7 +151,7 @@ def _one_comparison(pendulum, state, dt, steps, scheme, away):  # type: ignore[n
 
     leaves, tree = jax.tree.flatten(start)
     rest = jax.tree.unflatten(tree, [EPS * away[i] * leaf for i, leaf in enumerate(leaves)])
-    along = count_roundings(state)
+    along: Any = count_roundings(state)
     along = along if scheme.name == _GUIDE else (guide.enter(pendulum, state), along)
     carry = start, along, start, rest, (jnp.zeros_like(energy),) * 4
     coarse, _, _, _, (worst, growth, rate, drift) = march(step, carry, dt, steps)
@@ -180,11 +185,7 @@ compare = jax.jit(compare_motions, static_argnames="scheme")
 
 def _last_place(turns: Turns) -> Scalar:
     """What an angle far from zero is rounded by when its turns are added [rad]."""
-    return (
-        0.5
-        * float(np.finfo(float).eps)
-        * jnp.maximum(jnp.abs(turns.theta1[0]), jnp.abs(turns.theta2[0]))
-    )
+    return 0.5 * EPS * jnp.maximum(jnp.abs(turns.theta1[0]), jnp.abs(turns.theta2[0]))
 
 
 def angle_error(a: State, b: State) -> Scalar:
@@ -252,9 +253,7 @@ def find_scheme(
     """The method with a step at which the error of this motion is below `tolerance`, or as small as
     rounding or `most_steps` allow, and what a second pass told of it.
     """
-    rate = float(fastest_of_all(pendulum, state))
-    if not math.isfinite(rate):
-        rate = 0.0  # whatever the step, the status will say so
+    rate = float(np.nan_to_num(fastest_of_all(pendulum, state), posinf=0.0))  # a status tells of it
     steps = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN))
     if steps > most_steps:
         raise ValueError(

@@ -15,7 +15,7 @@ from dpend._runtime import require_float64
 from dpend.checks import Scalar, arrays, function, known_value, number, single
 from dpend.mechanics.pendulum import Pendulum, State, check_motion, check_state
 from dpend.mechanics.trig import unwound, wound
-from dpend.methods.runge_kutta import Point
+from dpend.methods.runge_kutta import Constants, Point
 from dpend.methods.scheme import Scheme, check_scheme
 
 Carry = TypeVar("Carry")
@@ -23,6 +23,10 @@ Carry = TypeVar("Carry")
 # Reverse mode keeps what every step computed, some 5 kB at order 8. Beyond this many steps it keeps
 # the states between blocks of sqrt(n) steps only and computes each block again.
 _CHECKPOINT_ABOVE = 1024
+# A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns
+# ten thousand times as fast as any that gravity moves: the lane is given up as NaN, so that no
+# other waits for it.
+_SHORTEST_STEP = 1e-5
 
 
 def march(
@@ -76,37 +80,6 @@ def float64(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float64)), tree)
 
 
-# A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns
-# ten thousand times as fast as any that gravity moves: the lane is given up as NaN, so that no
-# other waits for it.
-_SHORTEST_STEP = 1e-5
-
-
-class _Along(NamedTuple):
-    """What moves along a motion: the scheme's point, tangents (None without), and what `update`
-    accumulates.
-    """
-
-    point: Point
-    tangents: State | None
-    carry: Any
-
-
-def _folded(update, init, pendulum, state, tangents, duration, steps, scheme):  # type: ignore[no-untyped-def]
-    """The motion, its tangents and what `update` makes of it, over `duration`."""
-    state, turns = without_turns(state)
-    along = _Along(scheme.enter(pendulum, state), tangents, init)
-    shown = partial(_stepped, update, turns, scheme)
-    if scheme.even:
-        dt = step_size(duration, steps if not isinstance(steps, int) else max(steps, 1))
-        constants = scheme.constants(pendulum, dt)
-        along = march(partial(shown, constants), along, dt, steps)
-        end = scheme.leave(constants, along.point)
-    else:
-        end, along = _unevenly(shown, pendulum, state, along, duration, scheme)
-    return with_turns(end, turns), along.tangents, along.carry
-
-
 class Turns(NamedTuple):
     """The full turns of both angles, as `unwound` gives them."""
 
@@ -128,15 +101,53 @@ def with_turns(state: State, turns: Turns) -> State:
     )
 
 
-def _stepped(update, turns, scheme, constants, along, time, dt):  # type: ignore[no-untyped-def]
-    """One step shown to `update`."""
+class _Along(NamedTuple):
+    """What moves along a motion: the scheme's point, tangents (None without), and what `update`
+    accumulates.
+    """
+
+    point: Point
+    tangents: State | None
+    carry: Any
+
+
+def _accumulate(
+    update: Callable[..., Any],
+    start: tuple[State | None, Any],
+    pendulum: Pendulum,
+    state: State,
+    duration: Scalar,
+    steps: Scalar,
+    scheme: Scheme,
+) -> tuple[State, State | None, Any]:
+    """The end of the motion, its tangents and what `update` makes of it; both begin at `start`."""
+    state, turns = without_turns(state)
+    along = _Along(scheme.enter(pendulum, state), *start)
+    shown = partial(_show_step, update, turns, scheme)
+    if scheme.even:
+        dt = step_size(duration, steps if not isinstance(steps, int) else max(steps, 1))
+        constants = scheme.constants(pendulum, dt)
+        along = march(partial(shown, constants), along, dt, steps)
+        end = scheme.leave(constants, along.point)
+    else:
+        end, along = _march_unevenly(shown, pendulum, state, along, duration, scheme)
+    return with_turns(end, turns), along.tangents, along.carry
+
+
+def _show_step(
+    update: Callable[..., Any],
+    turns: Turns,
+    scheme: Scheme,
+    constants: Constants,
+    along: _Along,
+    time: Scalar,
+    dt: Scalar,
+) -> _Along:
+    """One step, shown to `update`."""
     if along.tangents is None:
         point = scheme.move(constants, along.point)
-        return _Along(
-            point,
-            None,
-            update(along.carry, time, dt, with_turns(scheme.leave(constants, point), turns)),
-        )
+        state = with_turns(scheme.leave(constants, point), turns)
+        return _Along(point, None, update(along.carry, time, dt, state))
     point, tangents = scheme.move_tangents(constants, along.point, along.tangents)
     state = with_turns(scheme.leave(constants, point), turns)
     carry, tangents = update(along.carry, time, dt, state, tangents)
@@ -156,7 +167,14 @@ def _any_of_many(size: int, batched: list[bool], going: Scalar) -> tuple[Scalar,
     return jnp.any(going), False
 
 
-def _unevenly(shown, pendulum, state, along, duration, scheme):  # type: ignore[no-untyped-def]
+def _march_unevenly(
+    shown: Callable[[Constants, _Along, Scalar, Scalar], _Along],
+    pendulum: Pendulum,
+    state: State,
+    along: _Along,
+    duration: Scalar,
+    scheme: Scheme,
+) -> tuple[State, _Along]:
     """Steps in the scheme's own time, the last one cut to end at `duration`.
 
     A lane that has arrived takes steps of length zero, which leave its point as it is to the bit,
@@ -169,13 +187,12 @@ def _unevenly(shown, pendulum, state, along, duration, scheme):  # type: ignore[
     def goes(time: Scalar) -> Scalar:
         return sense * (duration - time) > 0
 
-    def advance(carried):  # type: ignore[no-untyped-def]
-        along, time, before = carried
+    def advance(work: tuple[_Along, Scalar, Scalar]) -> tuple[_Along, Scalar, Scalar]:
+        along, time, before = work
         spin = scheme.spin(unit, along.point)
         # Between this step's start and its end u is not yet known: the last step's ratio tells
         # where it goes.
-        ahead = jnp.maximum(spin * (spin / before), 1.0)
-        root = jnp.sqrt(ahead)
+        root = jnp.sqrt(jnp.maximum(spin * (spin / before), 1.0))
         dt = longest / (root * jnp.sqrt(jnp.sqrt(root)))
         lost = ~(dt >= _SHORTEST_STEP * longest)  # also where it is not a number
         rest, live = duration - time, goes(time)
@@ -191,13 +208,14 @@ def _unevenly(shown, pendulum, state, along, duration, scheme):  # type: ignore[
     # A duration that is not finite leaves nothing of the start.
     point = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(duration), leaf, jnp.nan), along.point)
     along = along._replace(point=point)
-    carried = along, time, scheme.spin(unit, along.point)
-    along, _, _ = lax.while_loop(lambda carried: _any_lane(goes(carried[1])), advance, carried)
+    start = along, time, scheme.spin(unit, along.point)
+    along, _, _ = lax.while_loop(lambda work: _any_lane(goes(work[1])), advance, start)
     return scheme.leave(unit, along.point), along
 
 
-_fold = jax.jit(_folded, static_argnames=("update", "steps", "scheme"))
-_fold_traced = jax.jit(_folded, static_argnames=("update", "scheme"))
+# Numbers of steps that are known make a program each, which has both derivatives.
+_fold = jax.jit(_accumulate, static_argnames=("update", "steps", "scheme"))
+_fold_traced = jax.jit(_accumulate, static_argnames=("update", "scheme"))
 
 
 def _nothing(carry: Any, time: Scalar, dt: Scalar, state: State) -> Any:
@@ -225,8 +243,7 @@ def flow(
             arrays.
         RuntimeError: float64 is switched off in JAX.
     """
-    end, _, _ = _accumulate(_nothing, None, pendulum, state, None, duration, scheme)
-    return end
+    return _run(_nothing, (None, None), pendulum, state, duration, scheme)[0]
 
 
 def fold(
@@ -262,11 +279,19 @@ def fold(
     arrays("init", init)
     if tangents is not None:
         check_state(tangents, "tangents")
-    _, tangents, carry = _accumulate(update, init, pendulum, state, tangents, duration, scheme)
+    _, tangents, carry = _run(update, (tangents, init), pendulum, state, duration, scheme)
     return carry if tangents is None else (carry, tangents)
 
 
-def _accumulate(update, init, pendulum, state, tangents, duration, scheme):  # type: ignore[no-untyped-def]
+def _run(
+    update: Callable[..., Any],
+    start: tuple[State | None, Any],
+    pendulum: Pendulum,
+    state: State,
+    duration: Scalar,
+    scheme: Scheme,
+) -> tuple[State, State | None, Any]:
+    """`_accumulate` behind the checks, compiled for a known number of steps or for any."""
     require_float64()
     check_motion(pendulum, state)
     check_scheme(scheme)
@@ -280,9 +305,11 @@ def _accumulate(update, init, pendulum, state, tangents, duration, scheme):  # t
         count = jnp.where(jnp.isfinite(duration), jnp.abs(duration), 0.0) / scheme.step
         steps = jnp.maximum(jnp.ceil(count - 1e-9), 1).astype(int)
     compiled = _fold if isinstance(steps, int) else _fold_traced
-    init = jax.tree.map(_weakly_float64, init)
+    start = float64(start[0]), jax.tree.map(_weakly_float64, start[1])
     time = jnp.asarray(duration, jnp.float64)
-    return compiled(update, init, pendulum, float64(state), float64(tangents), time, steps, scheme)
+    end: tuple[State, State | None, Any]
+    end = compiled(update, start, pendulum, float64(state), time, steps, scheme)
+    return end
 
 
 def known_duration(duration: Scalar) -> float | None:

@@ -33,6 +33,11 @@ _MOST_ADAPTIVE_STEPS = 1_000_000
 # random motions less, at the worst 0.31 of it, where a small swing takes 18 steps (tolerances 1e-7
 # to 1e-13, against long double).
 _CHANGES = 5.0
+# Below this the rounding of a step is more than the error that its size is chosen by: all are taken
+# back for ever.
+_LEAST_TOLERANCE = 1e-13
+# The shortest step [1/(fastest rate at the start)].
+_LEAST_STEP = 1e-12
 
 
 def reference(
@@ -59,8 +64,7 @@ def reference(
         most_steps: how many steps are taken at most; each number has a program of its own.
     Returns:
         Trajectory, its `steps` those of the better solution; status `MAX_ITERATIONS` where that
-        would be more than
-            `most_steps`, `NONFINITE` where diffrax gave up otherwise.
+        would be more than `most_steps`, `NONFINITE` where diffrax gave up otherwise.
     Raises:
         ValueError: times empty, not finite, not monotonic or on both sides of zero; tolerance below
             1e-13.
@@ -78,6 +82,23 @@ def reference(
             f"{known:g}: "
             "give a larger tolerance"
         )
+    grid = jnp.asarray(_check_times(times))
+    state = float64(state)
+    roundings = count_roundings(state) if error else None
+    states, growth, steps, done = _dopri8(pendulum, state, roundings, grid, tolerance, most_steps)
+    estimate = jnp.asarray(jnp.nan)
+    if error:
+        coarse, *_ = _dopri8(pendulum, state, roundings, grid, 10 * tolerance, most_steps)
+        estimate = _CHANGES * angle_error(states, coarse) + jnp.fmin(EPS * growth, jnp.pi)
+    with_start = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), state, states)
+    lost = jnp.where(steps < most_steps, Status.NONFINITE, Status.MAX_ITERATIONS)
+    status = jnp.where(done, Status.CONVERGED, lost)
+    drift = energy_drift(pendulum, with_start)
+    return Trajectory(grid, states, drift, estimate, steps, status)
+
+
+def _check_times(times: Any) -> np.ndarray:
+    """The times [s], if they move away from zero in one direction."""
     grid = np.atleast_1d(numbers("times", times, unit="s"))
     if grid.ndim != 1:
         raise ValueError(
@@ -94,44 +115,26 @@ def reference(
             f"times must be finite and move away from zero in one direction, got {shown(grid)}: "
             f"sort them"
         )
-    state = float64(state)
-    roundings = count_roundings(state) if error else None
-    states, growth, steps, done = _dopri8(
-        pendulum, state, roundings, jnp.asarray(grid), tolerance, most_steps
-    )
-    estimate = jnp.asarray(jnp.nan)
-    if error:
-        coarse = _dopri8(pendulum, state, roundings, jnp.asarray(grid), 10 * tolerance, most_steps)[
-            0
-        ]
-        estimate = _CHANGES * angle_error(states, coarse) + jnp.fmin(EPS * growth, jnp.pi)
-    with_start = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), state, states)
-    lost = jnp.where(steps < most_steps, Status.NONFINITE, Status.MAX_ITERATIONS)
-    status = jnp.where(done, Status.CONVERGED, lost)
-    return Trajectory(
-        jnp.asarray(grid), states, energy_drift(pendulum, with_start), estimate, steps, status
-    )
-
-
-# Below this the rounding of a step is more than the error that its size is chosen by: all are taken
-# back for ever.
-_LEAST_TOLERANCE = 1e-13
+    return grid
 
 
 @partial(jax.jit, static_argnames="most_steps")
-def _dopri8(pendulum, state, tangents, times, tolerance, most_steps):  # type: ignore[no-untyped-def]
+def _dopri8(
+    pendulum: Pendulum,
+    state: State,
+    tangents: State | None,
+    times: Scalar,
+    tolerance: Scalar,
+    most_steps: int,
+) -> tuple[State, Scalar, Scalar, Scalar]:
     """States at `times`, what tangents of the angles grow to, steps taken, and whether diffrax
     succeeded.
     """
     import diffrax
 
     rate = jnp.fmax(fast_frequency(pendulum), fastest_rod(pendulum, state))
-    unit = State(
-        1.0,
-        1.0,
-        (pendulum.m1 + pendulum.m2) * pendulum.l1**2 * rate,
-        pendulum.m2 * pendulum.l2**2 * rate,
-    )
+    inertias = (pendulum.m1 + pendulum.m2) * pendulum.l1**2, pendulum.m2 * pendulum.l2**2
+    unit = State(1.0, 1.0, inertias[0] * rate, inertias[1] * rate)
 
     def field(scaled: State) -> State:
         here = jax.tree.map(jnp.multiply, scaled, unit)
@@ -140,7 +143,7 @@ def _dopri8(pendulum, state, tangents, times, tolerance, most_steps):  # type: i
         # say so at the end.
         return jax.tree.map(lambda leaf: jnp.where(_in_reach(here), leaf, 0.0), slopes)
 
-    def slope(time, pair, nothing):  # type: ignore[no-untyped-def]
+    def slope(time: Scalar, pair: Any, nothing: None) -> tuple[State, State | None]:
         scaled, tangents = pair
         slopes, push = jax.linearize(field, scaled)
         return slopes, None if tangents is None else jax.vmap(push)(tangents)
@@ -151,6 +154,9 @@ def _dopri8(pendulum, state, tangents, times, tolerance, most_steps):  # type: i
     if tangents is not None:
         tangents = jax.tree.map(lambda leaf, one: leaf / one, tangents, unit)
 
+    control = diffrax.PIDController(
+        rtol=tolerance, atol=tolerance, dtmin=_LEAST_STEP / rate, norm=_size_of_state
+    )
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(slope),
         diffrax.Dopri8(),
@@ -159,9 +165,7 @@ def _dopri8(pendulum, state, tangents, times, tolerance, most_steps):  # type: i
         dt0=None,
         y0=(jax.tree.map(jnp.divide, start, unit), tangents),
         saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=diffrax.PIDController(
-            rtol=tolerance, atol=tolerance, dtmin=1e-12 / rate, norm=_of_the_state
-        ),
+        stepsize_controller=control,
         max_steps=most_steps,
         throw=False,
     )
@@ -169,15 +173,11 @@ def _dopri8(pendulum, state, tangents, times, tolerance, most_steps):  # type: i
     states = jax.tree.map(jnp.multiply, scaled, unit)
     sound &= jnp.all(_in_reach(states))
     states = jax.tree.map(lambda leaf: jnp.where(sound, leaf, jnp.nan), states)
-    return (
-        states,
-        growth_along(tangents),
-        solution.stats["num_steps"],
-        sound & (solution.result == diffrax.RESULTS.successful),
-    )
+    done = sound & (solution.result == diffrax.RESULTS.successful)
+    return states, growth_along(tangents), solution.stats["num_steps"], done
 
 
-def _of_the_state(pair: tuple[State, State | None]) -> Scalar:
+def _size_of_state(pair: tuple[State, State | None]) -> Scalar:
     """The root mean square of the first, so that tangents have no say in the steps."""
     leaves = jax.tree.leaves(pair[0])
     return jnp.sqrt(sum(jnp.square(leaf) for leaf in leaves) / len(leaves))

@@ -283,14 +283,7 @@ def simulate(
     at_most_one(step=step, tolerance=tolerance)
     save_every, error = integer("save_every", save_every), flag("error", error)
     most_steps = integer("most_steps", most_steps)
-    if method is None:
-        method = "rk8-circle" if step is None else "rk8"
-    method = one_of("method", method, tuple(METHODS))
-    if not Scheme(method, 1.0).even:
-        raise ValueError(
-            f"method must take even steps to save states at, got {method!r}: give rk8-circle, or "
-            f"use flow"
-        )
+    method = _check_method(method, "rk8-circle" if step is None else "rk8")
     state = float64(state)
     if step is not None:
         scheme = Scheme(method, step)
@@ -302,6 +295,16 @@ def simulate(
     wish = _TOLERANCE if tolerance is None else tolerance
     tolerance = known_number("tolerance", wish, positive=True, unit="rad")
     return _to_tolerance(pendulum, state, duration, method, tolerance, save_every, most_steps)
+
+
+def _check_method(method: Any, default: str) -> str:
+    name = default if method is None else one_of("method", method, tuple(METHODS))
+    if not METHODS[name].even:
+        raise ValueError(
+            f"method must take even steps to save states at, got {name!r}: give rk8-circle, or use "
+            f"flow"
+        )
+    return name
 
 
 def _is_traced(pendulum: Pendulum, state: State) -> bool:
