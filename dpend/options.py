@@ -14,6 +14,7 @@ from dpend.checks import number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
 from dpend.records import parse_decimal
+from dpend.report import print_json
 
 # What a count fits in, here and in the compiled programs.
 _LARGEST_INTEGER = 2**63 - 1
@@ -88,6 +89,21 @@ def counted(help: str) -> Any:
     return typer.Option(parser=_integer, metavar="INTEGER", help=help)
 
 
+app = typer.Typer(
+    name="dpend",
+    help="The motions of a double pendulum that come back. Angles in degrees, everything else in "
+    "SI units.",
+    add_completion=False,
+    rich_markup_mode=None,  # square brackets are units here
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _commands() -> None:
+    """Keeps `dpend orbit` a subcommand."""
+
+
 # The options of every command: a pendulum, and how its result is printed.
 _PENDULUM = {
     "l1": (0.2, "Length of the upper rod [m]."),
@@ -96,6 +112,7 @@ _PENDULUM = {
     "m2": (0.1, "Mass of the lower bob [kg]."),
     "g": (9.8, "Acceleration of gravity [m/s^2]."),
 }
+Theta1 = Annotated[float, numeric("--theta1", help="Release angle of the upper rod [deg].")]
 _JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 # What a command hands back: its record for --json, how to print it for people, and whether all its
@@ -115,9 +132,7 @@ _SHARED = [
 _SHARED.append(_keyword("as_json", False, _JSON))
 
 
-def command(
-    app: typer.Typer, print_json: Callable[[dict[str, Any]], None], name: str | None = None
-) -> Callable[[Callable[..., Report]], Callable[..., int]]:
+def command(name: str | None = None) -> Callable[[Callable[..., Report]], Callable[..., int]]:
     """Makes a function of a pendulum and options a command, which takes the shared options too,
     prints its report, and has an exit status.
     """
