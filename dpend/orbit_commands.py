@@ -71,19 +71,13 @@ def orbit(
     ] = None,
 ) -> Report:
     """The releases from rest at THETA1 that come back: partner angle, period, stability, error."""
-    if (theta2 is None) != (period is None):
-        given, missing = ("theta2", "period") if period is None else ("period", "theta2")
-        raise ValueError(
-            f"{missing} must be given with {given}, got {given} alone: a guess is both"
-        )
+    guess = _guess(theta2, period)
     if crossing is not None and branch is None:
         raise ValueError(
             f"crossing must go with branch, got {crossing} alone: give --branch "
             f"{' or '.join(BRANCHES)}"
         )
-    release, guess = radians("theta1", theta1), None
-    if theta2 is not None:
-        guess = radians("theta2", theta2), number("period", period, positive=True, unit="s")
+    release = radians("theta1", theta1)
     both = branch is None and guess is None and ratio is None
     find = partial(
         dpend.find_orbit,
@@ -101,6 +95,18 @@ def orbit(
     ]
     record = {"orbits": records} if both else records[0]
     return record, partial(print_orbits, pendulum, records), converged(*found.values())
+
+
+def _guess(theta2: float | None, period: float | None) -> tuple[float, float] | None:
+    """What the two options say together [rad, s]."""
+    if theta2 is None and period is None:
+        return None
+    if theta2 is None or period is None:
+        given, missing = ("theta2", "period") if period is None else ("period", "theta2")
+        raise ValueError(
+            f"{missing} must be given with {given}, got {given} alone: a guess is both"
+        )
+    return radians("theta2", theta2), number("period", period, positive=True, unit="s")
 
 
 @command()
@@ -157,16 +163,7 @@ def atlas(
     """Every orbit released from rest up to a period: of one release angle, or all families of the
     whole square.
     """
-    if theta1 is not None and store is not None:
-        raise ValueError(
-            f"store goes with the whole square, got {store} with theta1: leave out either"
-        )
-    if out is not None:
-        check_place("out", out, (".csv", ".json"))
-        if store is not None and out.resolve() == store.resolve():
-            raise ValueError(
-                f"out must be another file than store, got {out} for both: give another name"
-            )
+    _check_places(theta1, out, store)
     steps = _steps_of_search(swinging_pendulum(pendulum), max_period, theta1)
     if steps <= most_steps:
         tell_cost(steps, steps * SECONDS_PER_STEP)
@@ -192,6 +189,19 @@ def atlas(
     solved = families and bool(np.all(found.table["status"] == Status.CONVERGED))
     solved = solved and not (found.coverage.suspicious_cells or found.coverage.exhausted)
     return found.record(), partial(print_atlas, found, theta1, out), solved
+
+
+def _check_places(theta1: float | None, out: Path | None, store: Path | None) -> None:
+    if theta1 is not None and store is not None:
+        raise ValueError(
+            f"store goes with the whole square, got {store} with theta1: leave out either"
+        )
+    if out is not None:
+        check_place("out", out, (".csv", ".json"))
+        if store is not None and out.resolve() == store.resolve():
+            raise ValueError(
+                f"out must be another file than store, got {out} for both: give another name"
+            )
 
 
 def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None) -> int | float:

@@ -26,7 +26,7 @@ catalogue.bicubic catalogue.scan catalogue.files catalogue.atlas catalogue.track
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.fit inverse.nearest
 inverse.design
 dpend
-plots animate report writing terminal options orbit_commands motion_commands cli
+plots animate report writing terminal options orbit_commands simulation_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.

@@ -269,22 +269,25 @@ def _column(column: str, rows: _Rows) -> np.ndarray:
     """A column in SI units; null is NaN, and what that means is asked for later."""
     cells, kind = rows.cells[column], COLUMNS[column]
     if column == "status":
-        known = {status.name.lower(): int(status) for status in Status}
-        for i, cell in enumerate(cells):
-            if type(cell) is not str or cell not in known:
-                raise ValueError(
-                    f"{rows.place(i)}: status must be one of {', '.join(known)}, is {cell!r:.60}"
-                )
-        return np.array([known[cell] for cell in cells], int)
-    if kind is float:
-        for i, cell in enumerate(cells):
-            if not (cell is None or type(cell) is float):
-                check_type(f"{rows.place(i)}: {column_name(column)}", cell, float)
-        values = np.array([math.nan if cell is None else cell for cell in cells], float)
-        return np.radians(values) if UNITS.get(column) == "deg" else values
+        return _statuses(rows)
     for i, cell in enumerate(cells):
-        check_type(f"{rows.place(i)}: {column_name(column)}", cell, kind)
-    return np.array(cells, kind)
+        if kind is not float or not (cell is None or type(cell) is float):
+            check_type(f"{rows.place(i)}: {column_name(column)}", cell, kind)
+    if kind is not float:
+        return np.array(cells, kind)
+    values = np.array([math.nan if cell is None else cell for cell in cells], float)
+    return np.radians(values) if UNITS.get(column) == "deg" else values
+
+
+def _statuses(rows: _Rows) -> np.ndarray:
+    cells = rows.cells["status"]
+    known = {status.name.lower(): int(status) for status in Status}
+    for i, cell in enumerate(cells):
+        if type(cell) is not str or cell not in known:
+            raise ValueError(
+                f"{rows.place(i)}: status must be one of {', '.join(known)}, is {cell!r:.60}"
+            )
+    return np.array([known[cell] for cell in cells], int)
 
 
 def _is_number(value: Any) -> bool:
