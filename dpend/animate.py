@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from dpend.records import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# Told after each frame how many are drawn, and of how many.
+Progress: TypeAlias = Callable[[int, int], None]
 
 # Okabe and Ito's palette, told apart by the colour-blind; its yellow is too pale for a line on
 # white.
@@ -112,7 +115,7 @@ def film(
     motions: Sequence[Trajectory] | Any,
     out: Path | Any,
     *,
-    progress: Callable[[int, int], None] | Any | None = None,
+    progress: Progress | Any | None = None,
 ) -> int:
     """Draws motions with common, equally spaced times into `out`; returns the number of frames.
 
@@ -155,7 +158,7 @@ def check_out(out: Path | Any) -> None:
         _encoder()
 
 
-def _encoder():  # type: ignore[no-untyped-def]
+def _encoder() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -176,7 +179,7 @@ def _count(motions: Sequence[Trajectory]) -> int:
     return (motions[0].time.size - 1) // _SAVED + 1
 
 
-def _canvas(pendulum: Pendulum) -> "tuple[Figure, object]":
+def _canvas(pendulum: Pendulum) -> "tuple[Figure, Any]":
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -193,31 +196,34 @@ def _canvas(pendulum: Pendulum) -> "tuple[Figure, object]":
 def _frames(pendulum: Pendulum, motions: Sequence[Trajectory]) -> Iterator[np.ndarray]:
     """Pictures of one saved time after another, RGB bytes of shape (480, 480, 3)."""
     figure, ax = _canvas(pendulum)
+    canvas: Any = figure.canvas
     joints = [_joints(pendulum, motion) for motion in motions]
     times = np.asarray(motions[0].time)
     tail = math.ceil(_TRAIL / abs(times[1] - times[0]))
     artists = []
     for index in range(len(motions)):
         colour = COLOURS[index % len(COLOURS)]
-        (trail,) = ax.plot([], [], color=colour, alpha=0.35, linewidth=1.5)  # type: ignore[attr-defined]
-        (rods,) = ax.plot([], [], "o-", color=colour, linewidth=2, markersize=8)  # type: ignore[attr-defined]
+        (trail,) = ax.plot([], [], color=colour, alpha=0.35, linewidth=1.5)
+        (rods,) = ax.plot([], [], "o-", color=colour, linewidth=2, markersize=8)
         artists.append((trail, rods))
-    clock = ax.text(0.03, 0.95, "", transform=ax.transAxes, fontsize=11)  # type: ignore[attr-defined]
+    clock = ax.text(0.03, 0.95, "", transform=ax.transAxes, fontsize=11)
     for i in range(0, times.size, _SAVED):
         for (trail, rods), where in zip(artists, joints, strict=True):
             trail.set_data(*where[max(0, i - tail) : i + 1, 2].T)
             rods.set_data(*where[i].T)
         clock.set_text(f"{times[i]:.2f} s")
-        figure.canvas.draw()
-        yield np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _write_gif(pendulum, motions, path, progress):  # type: ignore[no-untyped-def]
+def _write_gif(
+    pendulum: Pendulum, motions: Sequence[Trajectory], path: Path, progress: Progress
+) -> int:
     from PIL import Image
 
     total = _count(motions)
 
-    def pictures():  # type: ignore[no-untyped-def]
+    def pictures() -> Iterator[Any]:
         for done, frame in enumerate(_frames(pendulum, motions), 1):
             yield Image.fromarray(frame).quantize(64, dither=Image.Dither.NONE)
             progress(done, total)
@@ -229,7 +235,9 @@ def _write_gif(pendulum, motions, path, progress):  # type: ignore[no-untyped-de
     return total
 
 
-def _write_mp4(pendulum, motions, path, progress):  # type: ignore[no-untyped-def]
+def _write_mp4(
+    pendulum: Pendulum, motions: Sequence[Trajectory], path: Path, progress: Progress
+) -> int:
     total = _count(motions)
     writer = _encoder().write_frames(
         str(path), (_PIXELS, _PIXELS), fps=FRAMES_PER_SECOND, macro_block_size=16
@@ -248,7 +256,9 @@ def _write_mp4(pendulum, motions, path, progress):  # type: ignore[no-untyped-de
     return total
 
 
-def _write_png(pendulum, motions, path, progress):  # type: ignore[no-untyped-def]
+def _write_png(
+    pendulum: Pendulum, motions: Sequence[Trajectory], path: Path, progress: Progress
+) -> int:
     figure, ax = _canvas(pendulum)
     total = _count(motions)
     for index, motion in enumerate(motions):

@@ -57,19 +57,10 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
         ValueError: anything else: text, complex numbers, booleans, None, lists, integers beyond the
             range of float64.
     """
-    if isinstance(
-        value, float
-    ):  # the usual one, NumPy's float64 among them, without a look at anything else
+    if isinstance(value, float):  # the usual one, NumPy's float64 among them
         return np.float64(value)
     if isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.timedelta64)):
-        known: float | None
-        try:
-            known = float(value)
-        except (OverflowError, ValueError):  # the latter for a NaN that decimal arithmetic signals
-            known = None
-        if known is None or (math.isinf(known) and value != known):
-            raise ValueError(f"{name} must be {wanted}, got {shown(value)}: give one below 1.8e308")
-        return np.float64(known)
+        return _rounded(name, value, wanted)
     if not isinstance(value, (np.ndarray, jax.Array, jax.ShapeDtypeStruct)) and hasattr(
         value, "__array__"
     ):
@@ -83,6 +74,18 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
         require_float64()
         return value.astype(np.float64)
     return value
+
+
+def _rounded(name: str, value: Any, wanted: str) -> np.float64:
+    """An integer, a fraction or a decimal number as float64."""
+    try:
+        known = float(value)
+        beyond = math.isinf(known) and value != known
+    except (OverflowError, ValueError):  # the latter for a NaN that decimal arithmetic signals
+        beyond = True
+    if beyond:
+        raise ValueError(f"{name} must be {wanted}, got {shown(value)}: give one below 1.8e308")
+    return np.float64(known)
 
 
 def number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> Any:

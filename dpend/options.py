@@ -14,6 +14,7 @@ from dpend.checks import number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
 from dpend.records import parse_decimal
+from dpend.report import print_json
 
 # What a count fits in, here and in the compiled programs.
 _LARGEST_INTEGER = 2**63 - 1
@@ -30,27 +31,31 @@ class _Command(typer.core.TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         given, _, order = self.make_parser(ctx).parse_args(args=list(args))
         for option in self.params:
-            name, times = max(option.opts, key=len), sum(option is one for one in order)
-            if times > 1 and not option.multiple and option.nargs == 1:
-                raise ValueError(
-                    f"{name} must be given once at most, got it {times} times: leave out all but "
-                    f"one"
-                )
-            if "" in _several(given.get(option.name or "")):
-                raise ValueError(
-                    f"{name} must not be empty, got '': give a value, or leave {name} out"
-                )
+            _check_given(option, given.get(option.name or ""), sum(option is one for one in order))
         rest = super().parse_args(ctx, args)
         for option in self.params:
-            unit = re.search(r"( \[[^]]+\]|)[^]]*$", getattr(option, "help", None) or "")
-            for one in _several(ctx.params.get(option.name or "")):
-                if isinstance(one, float) and not math.isfinite(one):
-                    raise ValueError(
-                        f"{option.name} must be a finite number{unit[1] if unit else ''}, got "
-                        f"{one}: "
-                        f"give another {option.name}"
-                    )
+            _check_finite(option, ctx.params.get(option.name or ""))
         return rest
+
+
+def _check_given(option: Any, value: object, times: int) -> None:
+    name = max(option.opts, key=len)
+    if times > 1 and not option.multiple and option.nargs == 1:
+        raise ValueError(
+            f"{name} must be given once at most, got it {times} times: leave out all but one"
+        )
+    if "" in _several(value):
+        raise ValueError(f"{name} must not be empty, got '': give a value, or leave {name} out")
+
+
+def _check_finite(option: Any, value: object) -> None:
+    unit = re.search(r"( \[[^]]+\]|)[^]]*$", getattr(option, "help", None) or "")
+    for one in _several(value):
+        if isinstance(one, float) and not math.isfinite(one):
+            raise ValueError(
+                f"{option.name} must be a finite number{unit[1] if unit else ''}, got {one}: "
+                f"give another {option.name}"
+            )
 
 
 def _several(value: object) -> Sequence[object]:
@@ -88,6 +93,21 @@ def counted(help: str) -> Any:
     return typer.Option(parser=_integer, metavar="INTEGER", help=help)
 
 
+app = typer.Typer(
+    name="dpend",
+    help="The motions of a double pendulum that come back. Angles in degrees, everything else in "
+    "SI units.",
+    add_completion=False,
+    rich_markup_mode=None,  # square brackets are units here
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def _commands() -> None:
+    """Keeps `dpend orbit` a subcommand."""
+
+
 # The options of every command: a pendulum, and how its result is printed.
 _PENDULUM = {
     "l1": (0.2, "Length of the upper rod [m]."),
@@ -96,6 +116,7 @@ _PENDULUM = {
     "m2": (0.1, "Mass of the lower bob [kg]."),
     "g": (9.8, "Acceleration of gravity [m/s^2]."),
 }
+Theta1 = Annotated[float, numeric("--theta1", help="Release angle of the upper rod [deg].")]
 _JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 # What a command hands back: its record for --json, how to print it for people, and whether all its
@@ -115,9 +136,7 @@ _SHARED = [
 _SHARED.append(_keyword("as_json", False, _JSON))
 
 
-def command(
-    app: typer.Typer, print_json: Callable[[dict[str, Any]], None], name: str | None = None
-) -> Callable[[Callable[..., Report]], Callable[..., int]]:
+def command(name: str | None = None) -> Callable[[Callable[..., Report]], Callable[..., int]]:
     """Makes a function of a pendulum and options a command, which takes the shared options too,
     prints its report, and has an exit status.
     """
@@ -142,26 +161,31 @@ def radians(name: str, degrees: float) -> float:
     return math.radians(number(name, degrees, unit="deg"))
 
 
+def _check_wish(branch: str | None, of_one: bool, of_both: bool) -> None:
+    """Refuses a wish for no branch, and a branch without a wish for it."""
+    names = f"{' or '.join(BRANCHES)}"
+    if not of_one and not of_both:
+        raise ValueError(
+            "period, kappa or ratio must be given, got none of them: say what is wanted"
+        )
+    if branch is None and of_one:
+        raise ValueError(f"branch must be given with period and kappa, got none: give {names}")
+    if branch is not None and branch not in BRANCHES:
+        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    if branch is not None and not of_one:
+        raise ValueError(
+            f"branch must go with period or kappa, got {branch!r} with ratio alone, which is of "
+            f"both: leave it out"
+        )
+
+
 def equations_of(
     branch: str | None, period: float | None, kappa: float | None, ratio: float | None
 ) -> tuple[dict[str, Callable[[dict[str, PeriodicOrbit]], Any]], tuple[str, ...]]:
     """The equations of a design, each a function of the orbits by branch, and the branches whose
     orbits it takes.
     """
-    if period is None and kappa is None and ratio is None:
-        raise ValueError(
-            "period, kappa or ratio must be given, got none of them: say what is wanted"
-        )
-    if branch is None and (period is not None or kappa is not None):
-        raise ValueError(
-            f"branch must be given with period and kappa, got none: give {' or '.join(BRANCHES)}"
-        )
-    if branch is not None and branch not in BRANCHES:
-        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
-    if branch is not None and period is None and kappa is None:
-        raise ValueError(f"branch must go with period or kappa, got {branch!r} with ratio alone, "
-                         f"which is of both: "
-                         "leave it out")  # fmt: skip
+    _check_wish(branch, period is not None or kappa is not None, ratio is not None)
     equations: dict[str, Callable[[dict[str, PeriodicOrbit]], Any]] = {}
     if period is not None:
         seconds = float(number("period", period, positive=True, unit="s"))

@@ -25,6 +25,21 @@ if TYPE_CHECKING:
 UPPER, LOWER, NEUTRAL = "#0072B2", "#D55E00", "#555555"
 # Marks along a path, and pictures of a strobe: enough to see the speed, few enough to see each.
 _STROBES = 13
+# The marks of a family's special points, by the beginning of their kind.
+_MARKS = {"resonance": "|", "fold": "^", "stability": "o"}
+# What a map's colour bar says, and whether its values span decades.
+_LABELS = {
+    "lyapunov": ("Lyapunov exponent (1/s)", False),
+    "exponent": ("Lyapunov exponent (1/s)", False),
+    "megno": ("time-averaged MEGNO", False),
+    "flip_time": ("time of the first flip (s)", True),
+    "energy_drift": ("energy drift (of its scale)", True),
+}
+# The quantiles of a map's values between which its colours lie.
+_QUANTILES = (0.005, 0.995)
+# Cells along a picture's side; of larger maps every n-th cell is drawn, more than a screen shows
+# anyway.
+_MOST_CELLS = 1500
 
 
 def _axes(ax: Any) -> "Axes":
@@ -172,10 +187,6 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
     return fig
 
 
-# The marks of a family's special points, by the beginning of their kind.
-_MARKS = {"resonance": "|", "fold": "^", "stability": "o"}
-
-
 def family(
     curve: Family | Any,
     ax: "Axes | Any | None" = None,
@@ -241,21 +252,6 @@ def family(
     return ax
 
 
-# What a map's colour bar says, and whether its values span decades.
-_LABELS = {
-    "lyapunov": ("Lyapunov exponent (1/s)", False),
-    "exponent": ("Lyapunov exponent (1/s)", False),
-    "megno": ("time-averaged MEGNO", False),
-    "flip_time": ("time of the first flip (s)", True),
-    "energy_drift": ("energy drift (of its scale)", True),
-}
-
-
-# Cells along a picture's side; of larger maps every n-th cell is drawn, more than a screen shows
-# anyway.
-_MOST_CELLS = 1500
-
-
 def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" = None) -> "Axes":
     """One value of a two-dimensional sweep in colours, its first axis to the right, its second
     upwards.
@@ -270,9 +266,7 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
     Raises:
         ValueError: the dataset has not two dimensions, or no such value.
     """
-    import matplotlib.colors
     import xarray
-    from matplotlib.ticker import MultipleLocator
 
     instance("dataset", dataset, xarray.Dataset, "what dpend.sweep returns")
     names = [str(key) for key in dataset.data_vars]
@@ -286,40 +280,52 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
     ax = _axes(ax)
     every = -(-max(field.shape) // _MOST_CELLS)
     dataset = dataset.isel({dim: slice(None, None, every) for dim in field.dims})
-    field = dataset[name]
-    across, up = field.dims
-    label, decades = _LABELS.get(name.removesuffix("_error"), (name, False))
-    if name.endswith("_error"):
-        label, decades = f"error: {label}", True
-    values = np.asarray(field.values, np.float64).T
-    values = np.where(np.isfinite(values), values, np.nan)
-    # Quantiles: a few extreme cells would leave no colour to the others.
-    positive = (
-        values[np.isfinite(values) & (values > 0)] if decades else values[np.isfinite(values)]
-    )
-    low, high = np.quantile(positive, [0.005, 0.995]) if positive.size else (0.1, 1.0)
-    scale = matplotlib.colors.LogNorm if decades else matplotlib.colors.Normalize
-    norm = scale(low, max(high, low + 0.01 * abs(low)))
-    values = np.where(values <= 0, low, values) if decades else values
+    across, up = dataset[name].dims
     x, y = (_shown(dataset, key) for key in (across, up))
+    values, label, norm = _colours(dataset[name], name)
     mesh = ax.pcolormesh(
         x, y, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True
     )
     assert ax.figure is not None
     ax.figure.colorbar(mesh, ax=ax, label=label, extend="both")
-    for key, axis in ((across, ax.xaxis), (up, ax.yaxis)):
-        if key.startswith("theta"):
-            axis.set_label_text(f"{key} (deg)")
-            span = np.ptp(_shown(dataset, key))
-            if span > 180:
-                axis.set_major_locator(MultipleLocator(90 if span > 270 else 45))
-        else:
-            axis.set_label_text(f"{key} ({dataset[key].attrs.get('units', '')})")
-    if name == "flip_time" and {across, up} == {"theta1", "theta2"}:
-        _no_flip(dataset, ax, across)
+    _label_axis(ax.xaxis, dataset, across)
+    _label_axis(ax.yaxis, dataset, up)
     if {across, up} == {"theta1", "theta2"}:
+        if name == "flip_time":
+            _no_flip(dataset, ax, across)
         ax.set_aspect("equal")
     return ax
+
+
+def _colours(field: Any, name: str) -> tuple[np.ndarray, str, Any]:
+    """The values to draw, upwards along the first axis, what the colour bar says, and its scale.
+
+    The scale goes from one quantile to another: a few extreme cells would leave no colour to the
+    others.
+    """
+    from matplotlib.colors import LogNorm, Normalize
+
+    label, decades = _LABELS.get(name.removesuffix("_error"), (name, False))
+    if name.endswith("_error"):
+        label, decades = f"error: {label}", True
+    values = np.asarray(field.values, np.float64).T
+    values = np.where(np.isfinite(values), values, np.nan)
+    spread = values[np.isfinite(values) & ((values > 0) | (not decades))]
+    low, high = np.quantile(spread, _QUANTILES) if spread.size else (0.1, 1.0)
+    norm = (LogNorm if decades else Normalize)(low, max(high, low + 0.01 * abs(low)))
+    return np.where(decades & (values <= 0), low, values), label, norm
+
+
+def _label_axis(axis: Any, dataset: Any, key: str) -> None:
+    from matplotlib.ticker import MultipleLocator
+
+    if not key.startswith("theta"):
+        axis.set_label_text(f"{key} ({dataset[key].attrs.get('units', '')})")
+        return
+    axis.set_label_text(f"{key} (deg)")
+    span = np.ptp(_shown(dataset, key))
+    if span > 180:
+        axis.set_major_locator(MultipleLocator(90 if span > 270 else 45))
 
 
 def _shown(dataset: Any, key: str) -> np.ndarray:

@@ -1,9 +1,8 @@
 """What the command line prints and writes: records, tables, files and figures of each result."""
 
-import csv
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,11 @@ import jax
 import numpy as np
 
 import dpend
-from dpend.checks import check_place
 from dpend.mechanics.pendulum import Pendulum
 from dpend.motion.simulate import Trajectory
 from dpend.orbits.orbit import PeriodicOrbit
-from dpend.records import columns, json_text, record, replacing
+from dpend.records import columns, json_text, record
+from dpend.status import Status
 
 # Wider than any table here: a number is never broken to fit a terminal.
 _TABLE_WIDTH = 200
@@ -23,12 +22,14 @@ _TABLE_WIDTH = 200
 _SHOWN_POINTS = 12
 # Columns of words, which begin at the left; numbers end at the right.
 _WORDS = ("", "symmetry", "stability", "family", "from", "to")
-# What a design tells the derivatives of: its name, what it is multiplied by, and its heading.
+# What a design tells the derivatives of: its name, and what it is multiplied by.
 _SLOPES = {
-    "period_s": ("period", 1.0, "period (s)"),
-    "kappa": ("kappa", 1.0, "kappa"),
-    "theta2_deg": ("theta2", math.degrees(1.0), "theta2 (deg)"),
+    "theta2_deg": ("theta2", math.degrees(1.0)),
+    "period_s": ("period", 1.0),
+    "kappa": ("kappa", 1.0),
 }
+# The same as columns of the table, with their headings.
+_SLOPE_HEADINGS = {"period_s": "period (s)", "kappa": "kappa", "theta2_deg": "theta2 (deg)"}
 
 
 def orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
@@ -80,7 +81,7 @@ def design_record(
     found: dpend.Design, start: Pendulum, branches: tuple[str, ...], equations: tuple[str, ...]
 ) -> dict[str, Any]:
     def slopes(key: str, i: int) -> dict[str, float]:
-        of, scale, _ = _SLOPES[key]
+        of, scale = _SLOPES[key]
         rows = found.sensitivities[of].items()
         return {name: scale * float(np.atleast_1d(row)[i]) for name, row in rows}
 
@@ -106,6 +107,10 @@ def fit_record(fit: dpend.Fit) -> dict[str, Any]:
         "duration_s": float(fit.time[-1] - fit.time[0]),
         **record(fit, "windows iterations gap error_estimate status message pendulum"),
     }
+
+
+def converged(*results: Any) -> bool:
+    return all(int(result.status) == Status.CONVERGED for result in results)
 
 
 def print_json(found: dict[str, Any]) -> None:
@@ -270,10 +275,12 @@ def print_design(found: dict[str, Any], theta1: float) -> None:
     after = [*jax.tree.leaves(end), orbits[0]["theta1_deg"]]
     rows = []
     for (name, unit), one, other in zip(units.items(), before, after, strict=True):
-        slopes = [orbit["sensitivities"][key][name] for orbit in orbits for key in _SLOPES]
+        slopes = [orbit["sensitivities"][key][name] for orbit in orbits for key in _SLOPE_HEADINGS]
         cells = (f"{slope:.6g}" for slope in slopes)
         rows.append((f"{name} ({unit})", f"{float(one):g}", f"{float(other):.10g}", *cells))
-    headings = [f"{one['branch']}\n{heading}" for one in orbits for *_, heading in _SLOPES.values()]
+    headings = [
+        f"{one['branch']}\n{heading}" for one in orbits for heading in _SLOPE_HEADINGS.values()
+    ]
     title = "derivatives with respect to the logarithms"
     _print_table(title, ("", "start", "found", *headings), rows)
     missed = ", ".join(f"{name} {value:.0e}" for name, value in found["missed"].items())
@@ -316,78 +323,3 @@ def print_films(found: dict[str, Any], releases: Sequence[tuple[float, float]]) 
     )
     for (one, two), motion in zip(releases, found["motions"], strict=True):
         _print_failure(motion, f"({one:g}, {two:g}) deg: ")
-
-
-def writer(path: Path) -> Callable[[Trajectory], None]:
-    """How to write a motion to `path`; refuses before anything is computed what could not be
-    written after.
-    """
-    formats = {".csv": _write_csv, ".nc": _write_netcdf}
-    check_place("out", path, tuple(formats))
-
-    def write(motion: Trajectory) -> None:
-        with replacing(path) as draft:
-            formats[path.suffix](motion, draft)
-
-    return write
-
-
-def _write_csv(motion: Trajectory, path: Path) -> None:
-    table = columns(motion, "time") | columns(motion.state)
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(table)
-        rows.writerows(zip(*table.values(), strict=True))
-
-
-def write_family_csv(found: dict[str, Any], path: Path) -> None:
-    with path.open("w", newline="") as file:
-        rows = csv.DictWriter(file, found["points"][0])
-        rows.writeheader()
-        rows.writerows(found["points"])
-
-
-def write_json(found: dict[str, Any], path: Path) -> None:
-    path.write_text(json_text(found) + "\n")
-
-
-def _write_netcdf(motion: Trajectory, path: Path) -> None:
-    motion.to_xarray().to_netcdf(path, engine="scipy")
-
-
-def draw(field: Any, path: Path) -> None:
-    names = [
-        name for name in field.data_vars if name not in ("steps", "status", "bob", "bob_error")
-    ]
-
-    def picture() -> Any:
-        import matplotlib.pyplot as plt
-
-        from dpend import plots
-
-        size = (5.6 * len(names), 4.6)
-        fig, axes = plt.subplots(1, len(names), figsize=size, layout="constrained", squeeze=False)
-        for name, ax in zip(names, axes[0], strict=True):
-            plots.map_of(field, name, ax)
-        return fig
-
-    _save_figure(picture, path, dpi=200)
-
-
-def draw_fit(fit: dpend.Fit, path: Path) -> None:
-    from dpend import plots
-
-    _save_figure(lambda: plots.residuals(fit), path, dpi=150)
-
-
-def _save_figure(picture: Callable[[], Any], path: Path, dpi: int) -> None:
-    """Draws without a window, whatever the machine has."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    fig = picture()
-    with replacing(path) as draft:
-        fig.savefig(draft, dpi=dpi)
-    plt.close(fig)

@@ -13,7 +13,7 @@ from typer.main import get_command
 
 import dpend.catalogue.atlas
 import dpend.catalogue.scan
-from dpend import cli, report, terminal
+from dpend import cli, report, terminal, writing
 
 
 @pytest.fixture(autouse=True)
@@ -304,7 +304,7 @@ def test_a_failed_write_leaves_the_old_file(capsys, tmp_path, monkeypatch):
         path.write_text("half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(report, "_write_csv", fails)
+    monkeypatch.setattr(writing, "_write_csv", fails)
     arguments = (
         "simulate",
         "--theta1",

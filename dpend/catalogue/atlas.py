@@ -20,9 +20,8 @@ from dpend._runtime import require_float64
 from dpend.catalogue.files import (
     COLUMNS,
     UNITS,
-    file_name,
-    file_values,
-    pendulum_record,
+    column_name,
+    column_values,
     read_catalogue,
 )
 from dpend.catalogue.scan import (
@@ -51,7 +50,7 @@ from dpend.mechanics.trig import LARGEST_ANGLE
 from dpend.mechanics.units import natural
 from dpend.orbits.find import find_orbit, swinging_pendulum
 from dpend.orbits.orbit import RELEASED_SYMMETRIES, PeriodicOrbit
-from dpend.records import json_text, replacing
+from dpend.records import json_text, record, replacing
 from dpend.status import Status
 
 # Intervals of theta2 that a scan begins with, and how often they are doubled at most.
@@ -169,7 +168,7 @@ class Atlas:
         """All of it as plain numbers and text, angles in degrees: what `save` writes and `--json`
         prints.
         """
-        columns = {file_name(key): file_values(key, column) for key, column in self.table.items()}
+        columns = self._columns()
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         for row in rows:
             row["dual"] = {key: row.pop(f"dual_{key}") for key in ("theta1_deg", "theta2_deg")}
@@ -191,12 +190,16 @@ class Atlas:
         with replacing(path) as draft:
             draft.write_text(self._json() if path.suffix == ".json" else self._csv())
 
+    def _columns(self) -> dict[str, list[Any]]:
+        """The table as files have it."""
+        return {column_name(key): column_values(key, column) for key, column in self.table.items()}
+
     def _about(self) -> dict[str, Any]:
         from dpend._version import __version__
 
         return {
             "dpend_version": __version__,
-            "pendulum": pendulum_record(self.pendulum),
+            "pendulum": record(self.pendulum),
             "max_period_s": self.max_period,
             "units": dict(UNITS),
             "coverage": asdict(self.coverage),
@@ -219,10 +222,9 @@ class Atlas:
         text = io.StringIO()
         text.write("# " + json_text(self._about(), indent=None) + "\n")
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([file_name(key) for key in self.table])
-        writer.writerows(
-            zip(*(file_values(key, column) for key, column in self.table.items()), strict=True)
-        )
+        columns = self._columns()
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
         return text.getvalue()
 
 

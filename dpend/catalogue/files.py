@@ -20,7 +20,7 @@ import numpy as np
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.arc import SEGMENTS
 from dpend.orbits.orbit import RELEASED_SYMMETRIES
-from dpend.records import parse_json, read_text
+from dpend.records import file_name, parse_json, read_text, units_of
 from dpend.status import Status
 
 # Energies are compared in units of the weights' torques. That of the release is rounding away
@@ -83,7 +83,7 @@ COLUMNS: dict[str, type] = {
     "iterations": int,
     "status": int,
 }
-_PENDULUM = {"l1": "l1_m", "l2": "l2_m", "m1": "m1_kg", "m2": "m2_kg", "g": "g_m_s2"}
+_PENDULUM = {name: file_name(name, unit) for name, unit in units_of(Pendulum).items()}
 # What else the file says, and the types of it.
 _ABOUT = {
     "dpend_version": str,
@@ -164,22 +164,17 @@ class _Rows(NamedTuple):
     place: Callable[[int], str]
 
 
-def file_name(column: str) -> str:
+def column_name(column: str) -> str:
     """A column's name in a file."""
     return f"{column}_{UNITS[column]}" if column in UNITS else column
 
 
-def file_values(column: str, values: np.ndarray) -> list[Any]:
+def column_values(column: str, values: np.ndarray) -> list[Any]:
     """A column as a file has it: angles in degrees, the status by its name."""
     if column == "status":
         return [Status(value).name.lower() for value in values.tolist()]
     converted: list[Any] = (np.degrees(values) if UNITS.get(column) == "deg" else values).tolist()
     return converted
-
-
-def pendulum_record(pendulum: Pendulum) -> dict[str, float]:
-    """A pendulum as it stands in files."""
-    return {key: float(getattr(pendulum, name)) for name, key in _PENDULUM.items()}
 
 
 def read_catalogue(path: Path) -> Catalogue:
@@ -217,7 +212,7 @@ def _csv_parts(text: str) -> tuple[Any, _Rows]:
     header = [name.strip() for name in found[0][0]] if found else []
     if header and header[0].startswith("#"):
         raise ValueError("line 2 must be the header, and is another comment")
-    _check_names("the header", header, [file_name(key) for key in COLUMNS])
+    _check_names("the header", header, [column_name(key) for key in COLUMNS])
     for i, (row, line) in enumerate(found[1:]):
         if len(row) != len(header):
             raise ValueError(
@@ -229,7 +224,7 @@ def _csv_parts(text: str) -> tuple[Any, _Rows]:
     def place(i: int) -> str:
         return f"row {i + 1} in line {found[i + 1][1]}"
 
-    cells = {key: _parse_cells(key, by_name[file_name(key)], place) for key in COLUMNS}
+    cells = {key: _parse_cells(key, by_name[column_name(key)], place) for key in COLUMNS}
     return about, _Rows(cells, place)
 
 
@@ -242,7 +237,7 @@ def _parse_cells(column: str, cells: Sequence[str], place: Callable[[int], str])
     for i, cell in enumerate(cells):
         if not pattern.fullmatch(cell):
             raise ValueError(
-                f"{place(i)}: {file_name(column)} must be {_TYPES[kind]}, is {cell!r:.60}"
+                f"{place(i)}: {column_name(column)} must be {_TYPES[kind]}, is {cell!r:.60}"
             )
     return [kind(cell) for cell in cells]
 
@@ -251,7 +246,7 @@ def _json_parts(text: str) -> tuple[Any, _Rows]:
     about = parse_json(text)
     if type(about) is not dict or type(about.get("orbits")) is not list:
         raise ValueError("it must be an object with a list called orbits")
-    names = [file_name(key) for key in COLUMNS]
+    names = [column_name(key) for key in COLUMNS]
     angles = ("theta1_deg", "theta2_deg")
     own = [name for name in names if name[:5] not in ("dual_", "turns")] + ["dual", "turns"]
     rows = about.pop("orbits")
@@ -266,7 +261,7 @@ def _json_parts(text: str) -> tuple[Any, _Rows]:
         row |= {f"dual_{key}": value for key, value in dual.items()}
         row |= {"turns1": turns[0], "turns2": turns[1]}
     return about, _Rows(
-        {key: [row[file_name(key)] for row in rows] for key in COLUMNS}, lambda i: f"row {i + 1}"
+        {key: [row[column_name(key)] for row in rows] for key in COLUMNS}, lambda i: f"row {i + 1}"
     )
 
 
@@ -274,22 +269,25 @@ def _column(column: str, rows: _Rows) -> np.ndarray:
     """A column in SI units; null is NaN, and what that means is asked for later."""
     cells, kind = rows.cells[column], COLUMNS[column]
     if column == "status":
-        known = {status.name.lower(): int(status) for status in Status}
-        for i, cell in enumerate(cells):
-            if type(cell) is not str or cell not in known:
-                raise ValueError(
-                    f"{rows.place(i)}: status must be one of {', '.join(known)}, is {cell!r:.60}"
-                )
-        return np.array([known[cell] for cell in cells], int)
-    if kind is float:
-        for i, cell in enumerate(cells):
-            if not (cell is None or type(cell) is float):
-                check_type(f"{rows.place(i)}: {file_name(column)}", cell, float)
-        values = np.array([math.nan if cell is None else cell for cell in cells], float)
-        return np.radians(values) if UNITS.get(column) == "deg" else values
+        return _statuses(rows)
     for i, cell in enumerate(cells):
-        check_type(f"{rows.place(i)}: {file_name(column)}", cell, kind)
-    return np.array(cells, kind)
+        if kind is not float or not (cell is None or type(cell) is float):
+            check_type(f"{rows.place(i)}: {column_name(column)}", cell, kind)
+    if kind is not float:
+        return np.array(cells, kind)
+    values = np.array([math.nan if cell is None else cell for cell in cells], float)
+    return np.radians(values) if UNITS.get(column) == "deg" else values
+
+
+def _statuses(rows: _Rows) -> np.ndarray:
+    cells = rows.cells["status"]
+    known = {status.name.lower(): int(status) for status in Status}
+    for i, cell in enumerate(cells):
+        if type(cell) is not str or cell not in known:
+            raise ValueError(
+                f"{rows.place(i)}: status must be one of {', '.join(known)}, is {cell!r:.60}"
+            )
+    return np.array([known[cell] for cell in cells], int)
 
 
 def _is_number(value: Any) -> bool:
@@ -426,7 +424,7 @@ class _Check(NamedTuple):
         else:
             shown = repr(value.item())
         against = says if other is None else f"{says} {other[i]:.10g}"
-        raise ValueError(f"{self.place(i)}: {file_name(column)} is {shown}, {against}")
+        raise ValueError(f"{self.place(i)}: {column_name(column)} is {shown}, {against}")
 
     def run(self, pendulum: Pendulum, max_period: float, families: Families) -> None:
         """Refuses the first row that no orbit has: where a solve failed, numbers may be missing and

@@ -1,0 +1,259 @@
+"""The commands about orbits: `orbit`, `family`, `atlas` and `design`.
+
+A command takes the pendulum that `options.command` makes of the shared options, and a parameter for
+each option of its own: these may be more than seven. It hands back a report, which is printed.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+import typer
+
+import dpend
+from dpend.catalogue import survey
+from dpend.catalogue.atlas import MOST_SEARCH_STEPS, SECONDS_PER_STEP, expected_steps, known_period
+from dpend.checks import check_place, number
+from dpend.mechanics.pendulum import Pendulum
+from dpend.options import (
+    Report,
+    Theta1,
+    bounds_in,
+    command,
+    counted,
+    equations_of,
+    names_in,
+    numeric,
+    radians,
+)
+from dpend.orbits.find import swinging_pendulum
+from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
+from dpend.records import replacing
+from dpend.report import (
+    converged,
+    design_record,
+    family_record,
+    orbit_record,
+    print_atlas,
+    print_design,
+    print_family,
+    print_orbits,
+)
+from dpend.status import Status
+from dpend.terminal import clock, tell_cost, work
+from dpend.writing import write_family_csv, write_json
+
+
+@command()
+def orbit(
+    pendulum: Pendulum,
+    theta1: Theta1,
+    branch: Annotated[
+        str | None,
+        typer.Option(help="in-phase or anti-phase; both, if neither this nor a guess is given."),
+    ] = None,
+    theta2: Annotated[
+        float | None, numeric(help="Guess of the lower rod's release angle [deg].")
+    ] = None,
+    period: Annotated[float | None, numeric(help="Guess of the period [s].")] = None,
+    symmetry: Annotated[
+        str | None, typer.Option(help="centred or brake, with a guess; found out if not given.")
+    ] = None,
+    ratio: Annotated[
+        int | None,
+        counted("1 or -1: theta2 = ratio theta1, the release nearest to THETA1."),
+    ] = None,
+    crossing: Annotated[
+        int | None,
+        counted("Which of the branch's passages through theta1; 1 if not given."),
+    ] = None,
+) -> Report:
+    """The releases from rest at THETA1 that come back: partner angle, period, stability, error."""
+    guess = _guess(theta2, period)
+    if crossing is not None and branch is None:
+        raise ValueError(
+            f"crossing must go with branch, got {crossing} alone: give --branch "
+            f"{' or '.join(BRANCHES)}"
+        )
+    release = radians("theta1", theta1)
+    both = branch is None and guess is None and ratio is None
+    find = partial(
+        dpend.find_orbit,
+        guess=guess,
+        symmetry=symmetry,
+        ratio=ratio,
+        crossing=1 if crossing is None else crossing,
+    )
+    with clock("following the branch" if guess is None else "solving"):
+        found = {
+            name: find(pendulum, release, branch=name) for name in (BRANCHES if both else (branch,))
+        }
+    records = [
+        orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()
+    ]
+    record = {"orbits": records} if both else records[0]
+    return record, partial(print_orbits, pendulum, records), converged(*found.values())
+
+
+def _guess(theta2: float | None, period: float | None) -> tuple[float, float] | None:
+    """What the two options say together [rad, s]."""
+    if theta2 is None and period is None:
+        return None
+    if theta2 is None or period is None:
+        given, missing = ("theta2", "period") if period is None else ("period", "theta2")
+        raise ValueError(
+            f"{missing} must be given with {given}, got {given} alone: a guess is both"
+        )
+    return radians("theta2", theta2), number("period", period, positive=True, unit="s")
+
+
+@command()
+def family(
+    pendulum: Pendulum,
+    branch: Annotated[str, typer.Option(help="in-phase (slow mode) or anti-phase (fast mode).")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Write all points to F.csv, or to F.json what --json prints."),
+    ] = None,
+) -> Report:
+    """All orbits of a normal mode, from small swings to the upright pendulum, and where their
+    stability changes.
+    """
+    if branch not in BRANCHES:
+        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
+    formats = {".csv": write_family_csv, ".json": write_json}
+    if out is not None:
+        check_place("out", out, tuple(formats))
+    with clock("following the family"):
+        found = dpend.follow_family(pendulum, branch)
+    record = family_record(found, branch)
+    if out is not None:
+        with replacing(out) as draft:
+            formats[out.suffix](record, draft)
+    return record, partial(print_family, record, out), converged(found)
+
+
+@command()
+def atlas(
+    pendulum: Pendulum,
+    max_period: Annotated[float, numeric(help="The longest period [s].")],
+    theta1: Annotated[
+        float | None,
+        numeric(
+            "--theta1", help="Release angle of the upper rod [deg]; the whole square without it."
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the atlas to F.csv or F.json.")] = None,
+    store: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of the whole square: F.json, from which a search that was stopped goes on."
+        ),
+    ] = None,
+    most_steps: Annotated[
+        float,
+        numeric(
+            help="Refuse a search that takes more time steps, or stop there: 1e9 take about an "
+            "hour."
+        ),
+    ] = float(MOST_SEARCH_STEPS),
+) -> Report:
+    """Every orbit released from rest up to a period: of one release angle, or all families of the
+    whole square.
+    """
+    _check_places(theta1, out, store)
+    steps = _steps_of_search(swinging_pendulum(pendulum), max_period, theta1)
+    if steps <= most_steps:
+        tell_cost(steps, steps * SECONDS_PER_STEP)
+    limits = {"max_period": max_period, "most_steps": most_steps}
+    with work("slices" if theta1 is None else "million steps") as show:
+        if theta1 is None:
+            found = dpend.find_brake_families(
+                pendulum,
+                **limits,
+                store=store,
+                progress=lambda done, planned, families: show(done, planned),
+            )
+        else:
+            found = dpend.find_brake_orbits(
+                pendulum,
+                **limits,
+                theta1=radians("theta1", theta1),
+                progress=lambda done, planned: show(done / 1e6, planned / 1e6),
+            )
+    if out is not None:
+        found.save(out)
+    families = all(family["status"] == "converged" for family in found.families)
+    solved = families and bool(np.all(found.table["status"] == Status.CONVERGED))
+    solved = solved and not (found.coverage.suspicious_cells or found.coverage.exhausted)
+    return found.record(), partial(print_atlas, found, theta1, out), solved
+
+
+def _check_places(theta1: float | None, out: Path | None, store: Path | None) -> None:
+    if theta1 is not None and store is not None:
+        raise ValueError(
+            f"store goes with the whole square, got {store} with theta1: leave out either"
+        )
+    if out is not None:
+        check_place("out", out, (".csv", ".json"))
+        if store is not None and out.resolve() == store.resolve():
+            raise ValueError(
+                f"out must be another file than store, got {out} for both: give another name"
+            )
+
+
+def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None) -> int | float:
+    known_period(pendulum, max_period)
+    if theta1 is None:
+        return survey.expected_steps(pendulum, max_period)
+    return expected_steps(pendulum, max_period, radians("theta1", theta1))
+
+
+@command()
+def design(
+    pendulum: Pendulum,
+    theta1: Theta1,
+    branch: Annotated[
+        str | None,
+        typer.Option(help="in-phase or anti-phase: whose orbit --period and --kappa are about."),
+    ] = None,
+    period: Annotated[float | None, numeric(help="Wanted period [s].")] = None,
+    kappa: Annotated[
+        float | None, numeric(help="Wanted kappa: stable from -1 to 1, most so at 0.")
+    ] = None,
+    ratio: Annotated[
+        float | None,
+        numeric(help="Wanted period of the in-phase orbit over that of the anti-phase orbit."),
+    ] = None,
+    free: Annotated[
+        str, typer.Option(metavar="NAMES", help="What may change, of l1,l2,m1,m2,g,theta1.")
+    ] = "l1,l2",
+    bounds: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=A:B", help="Bounds of one of them (theta1 in degrees); once a name."
+        ),
+    ] = None,
+) -> Report:
+    """The pendulum nearest to this one whose orbit released at THETA1 has a wanted period,
+    stability, or both.
+    """
+    equations, branches = equations_of(branch, period, kappa, ratio)
+    if not 0 < number("theta1", theta1, unit="deg") < 180:
+        raise ValueError(
+            f"theta1 must be between 0 and 180 deg, got {theta1:g}: give another theta1"
+        )
+
+    def loss(*orbits: PeriodicOrbit) -> Any:
+        by_name = dict(zip(branches, orbits, strict=True))
+        return jax.numpy.stack([equation(by_name) for equation in equations.values()])
+
+    names, limits, angle = names_in(free), bounds_in(bounds or []), radians("theta1", theta1)
+    with clock("designing"):
+        found = dpend.design_pendulum(
+            loss, pendulum, names, branch=branches, theta1=angle, bounds=limits
+        )
+    record = design_record(found, pendulum, branches, tuple(equations))
+    return record, partial(print_design, record, theta1), converged(found)
