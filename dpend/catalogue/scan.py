@@ -101,9 +101,7 @@ class Budget:
 
 
 class Outlook(NamedTuple):
-    """What a scan has before it: the rows of each motion, and the waves that p makes along
-    theta2.
-    """
+    """What a scan has before it: rows of each motion, and waves that p makes along theta2."""
 
     rows: int
     waves: float
@@ -331,9 +329,7 @@ def _places(some: Intervals) -> list[tuple[float, float]]:
 
 
 def _distinct(zeros: list[Zero], dt: float) -> tuple[Zero, ...]:
-    """In order of theta2 in (-pi, pi], each once: those on an edge of their cell are found from
-    both its sides.
-    """
+    """In order of theta2 in (-pi, pi], each once."""
     kept: list[Zero] = []
     for zero in sorted(zeros, key=lambda zero: zero.time):
         theta2 = zero.theta2 - 2 * np.pi * math.ceil(zero.theta2 / (2 * np.pi) - 0.5 - 1e-12)

@@ -7,9 +7,8 @@ known of the orbits as functions of x: no iteration is differentiated, and one c
 serves all branches, losses and free parameters.
 
 - goal `zero`: of the solutions of loss = 0 within the bounds the nearest one, the least |x|^2/2.
-  Newton's method on the Lagrange conditions (sequential quadratic programming): each step is the
-  nearest solution of the linearised equations within the bounds. As many equations as unknowns
-  leave plain Newton.
+  SciPy's SLSQP (sequential quadratic programming): each step is the nearest solution of the
+  linearised equations within the bounds. A last Newton step gives the digits.
 - goal `minimum`: optax's L-BFGS, projected onto the bounds. Its steps are combinations of
   gradients, so that x stays at right angles to whatever the loss does not depend on: of a scale
   that does not matter the nearest value is kept.
@@ -37,12 +36,27 @@ from dpend.status import message
 
 GOALS = ("zero", "minimum")
 
-# Without bounds a parameter may grow and shrink by this factor: as far as branches are known to be
-# followed.
+# Without bounds of its own, a parameter may grow and shrink by this factor. Branches are known to
+# be followed as far.
 _FACTOR = 10.0
-# Below pi [rad] by more than rounding, and where theta1 may get by itself: the branches end at the
-# former.
-_LARGEST_ANGLE, _LARGEST_WITHOUT_BOUNDS = math.pi * (1 - 1e-12), 0.999 * math.pi
+# Branches end at theta1 = pi; theta1 stays below this.
+_LARGEST_ANGLE = math.pi * (1 - 1e-12)
+# Without bounds of its own, theta1 does not exceed this.
+_LARGEST_WITHOUT_BOUNDS = 0.999 * math.pi
+_MESSAGES = {
+    Status.CONVERGED: "Found.",
+    Status.MAX_ITERATIONS: "The search did not converge in the allowed iterations, or stalled: "
+    "start from the pendulum "
+    "it came to.",
+    Status.LEFT_BRANCH: "The search was stopped where the branch cannot be followed to this "
+    "release: change the start, "
+    "or the bounds.",
+    Status.NO_SUCH_ORBIT: "The search was stopped where the branch ends without reaching this "
+    "release: change the "
+    "start, or the bounds.",
+    Status.NO_SOLUTION: "No solution was found within the bounds: the least sum of squares near "
+    "the start is returned.",
+}
 
 
 @jax.tree_util.register_dataclass
@@ -88,6 +102,7 @@ class Design:
         return message(self.status)
 
 
+# The public signature asks for more than seven parameters.
 def design_pendulum(
     loss: Any,
     pendulum: Any,
@@ -159,23 +174,25 @@ def design_pendulum(
     low, high = _box(values, names, bounds)
     problem = DesignProblem(loss, start, branches, angles, low, high)
     first = problem.at(np.zeros(len(PARAMETERS)))
-    equations = first.value.size
-    if goal == "minimum" and equations != 1:
-        raise ValueError(
-            f"loss must be a scalar for a minimum, got {equations} values: add them up"
-        )
-    if goal == "zero" and not 1 <= equations <= len(names):
-        raise ValueError(
-            f"free must name as many parameters as there are equations or more, got {len(names)} "
-            f"for {equations}: name "
-            "others too, or ask for the minimum of a scalar"
-        )
+    _check_equations(goal, first.value.size, len(names))
     if not first.sound:
         return _result(problem, first, 0, first.status)
     if goal == "minimum":
         return _result(problem, *least_on_bounds(problem, first, max_iterations, loss_itself))
     solve = nearest_of_one if len(names) == 1 else nearest_of_many
     return _result(problem, *solve(problem, first, max_iterations))
+
+
+def _check_equations(goal: str, equations: int, unknowns: int) -> None:
+    if goal == "minimum" and equations != 1:
+        raise ValueError(
+            f"loss must be a scalar for a minimum, got {equations} values: add them up"
+        )
+    if goal == "zero" and not 1 <= equations <= unknowns:
+        raise ValueError(
+            f"free must name as many parameters as there are equations or more, got {unknowns} for "
+            f"{equations}: name others too, or ask for the minimum of a scalar"
+        )
 
 
 def _read_orbits(branch: Any, theta1: Any) -> tuple[tuple[str, ...], tuple[float, ...]]:
@@ -237,40 +254,32 @@ def _box(
                 f"{', '.join(names)}"
             )
     for name in names:
-        start, i = values[name], PARAMETERS.index(name)
-        pair = given.get(name, (start / _FACTOR, start * _FACTOR))
-        if name == "theta1" and name not in given:
-            pair = (start / _FACTOR, max(start, min(start * _FACTOR, _LARGEST_WITHOUT_BOUNDS)))
-        pair = several(f"bounds of {name}", pair, "a pair (low, high)", 2)
-        least, most = (known_number(f"bounds of {name}", bound, positive=True) for bound in pair)
-        if not least < most or not least <= start <= most:
-            raise ValueError(
-                f"bounds of {name} must be two numbers with the start, {start:g}, between them, "
-                f"got "
-                f"({least:g}, {most:g}): give others, or another start"
-            )
-        if name == "theta1" and not most < _LARGEST_ANGLE:
-            raise ValueError(
-                f"bounds of theta1 must be below pi [rad], got {most:g}: give another upper bound"
-            )
+        i, start = PARAMETERS.index(name), values[name]
+        least, most = _bounds_of(name, start, given)
         low[i], high[i] = math.log(least / start), math.log(most / start)
     return low, high
 
 
+def _bounds_of(name: str, start: float, given: Mapping[str, Any]) -> tuple[float, float]:
+    """The bounds of a parameter in its unit."""
+    pair = given.get(name, (start / _FACTOR, start * _FACTOR))
+    if name == "theta1" and name not in given:
+        pair = (start / _FACTOR, max(start, min(start * _FACTOR, _LARGEST_WITHOUT_BOUNDS)))
+    pair = several(f"bounds of {name}", pair, "a pair (low, high)", 2)
+    least, most = (known_number(f"bounds of {name}", bound, positive=True) for bound in pair)
+    if not least < most or not least <= start <= most:
+        raise ValueError(
+            f"bounds of {name} must be two numbers with the start, {start:g}, between them, got "
+            f"({least:g}, {most:g}): give others, or another start"
+        )
+    if name == "theta1" and not most < _LARGEST_ANGLE:
+        raise ValueError(
+            f"bounds of theta1 must be below pi [rad], got {most:g}: give another upper bound"
+        )
+    return least, most
+
+
 def _result(problem: DesignProblem, look: Look, steps: int, status: int) -> Design:
-    parameters = [
-        np.array([*jax.tree.leaves(orbit.pendulum), orbit.theta1]) for orbit in look.orbits
-    ]
-    rates = [np.asarray(rate) * row for rate, row in zip(look.slopes, parameters, strict=True)]
-    single = len(rates) == 1
-    periods = np.array([float(orbit.period) for orbit in look.orbits])
-    by_orbit = {
-        "theta2": np.array([rate[0] for rate in rates]),
-        "period": np.array([rate[1] for rate in rates]) * periods[:, None],
-        "kappa": np.array([rate[2] for rate in rates]),
-    }
-    table = {"loss": look.jacobian[0] if look.value.size == 1 else look.jacobian}
-    table |= {name: rows[0] if single else rows for name, rows in by_orbit.items()}
     free = problem.free
     at = (look.x[free] <= problem.low[free]) | (look.x[free] >= problem.high[free])
     return Design(
@@ -279,12 +288,25 @@ def _result(problem: DesignProblem, look: Look, steps: int, status: int) -> Desi
         theta1=tuple(orbit.theta1 for orbit in look.orbits),
         loss=jnp.asarray(look.value[0] if look.value.size == 1 else look.value),
         distance=jnp.asarray(np.linalg.norm(look.x)),
-        sensitivities={
-            name: {key: jnp.asarray(rows[..., i]) for i, key in enumerate(PARAMETERS)}
-            for name, rows in table.items()
-        },
+        sensitivities=_sensitivities(look),
         iterations=jnp.asarray(steps),
         looks=jnp.asarray(problem.looks),
         status=jnp.asarray(int(status)),
         at_bounds=tuple(PARAMETERS[i] for i in free[at]),
     )
+
+
+def _sensitivities(look: Look) -> dict[str, dict[str, Scalar]]:
+    """Derivatives of the loss and of the orbits with respect to the logarithms of `PARAMETERS`."""
+    rows = []
+    for orbit, slope in zip(look.orbits, look.slopes, strict=True):
+        rate = np.asarray(slope) * np.array([*jax.tree.leaves(orbit.pendulum), orbit.theta1])
+        rows.append([rate[0], rate[1] * float(orbit.period), rate[2]])
+    by_orbit = np.swapaxes(np.array(rows), 0, 1)
+    table = {"loss": look.jacobian[0] if look.value.size == 1 else look.jacobian}
+    for name, each in zip(("theta2", "period", "kappa"), by_orbit, strict=True):
+        table[name] = each[0] if len(rows) == 1 else each
+    return {
+        name: {key: jnp.asarray(each[..., i]) for i, key in enumerate(PARAMETERS)}
+        for name, each in table.items()
+    }

@@ -117,6 +117,34 @@ def load_angles(path: str | Path | Any) -> tuple[np.ndarray, np.ndarray | None, 
     path = file_path("path", path)
     rows, lines = _rows(path)
     header = [name.strip() for name in rows[0]]
+    present = _check_header(header, path)
+    for row, line in zip(rows, lines, strict=True):
+        if len(row) != len(header):
+            raise ValueError(
+                f"row {line} of {path} must have {len(header)} cells, got {len(row)}: mend the row"
+            )
+
+    def column(name: str, gaps: bool) -> np.ndarray:
+        place, body = header.index(name), zip(rows[1:], lines[1:], strict=True)
+        return np.array([_cell(row[place], name, line, path, gaps) for row, line in body])
+
+    when = column("time_s", False)
+    values = np.full((2, when.size), np.nan)
+    for i, name in enumerate(_COLUMNS):
+        if name in present:
+            values[i] = np.radians(column(f"{name}_deg", True))
+    there = [name in present for name in _COLUMNS]
+
+    def where(name: str, i: int) -> str:
+        return f"{'time_s' if name == 'times' else f'{name}_deg'} in row {lines[i + 1]} of {path}"
+
+    _check(Angles(when, values), there, where, "in degrees")
+    theta1, theta2 = (each if given else None for each, given in zip(values, there, strict=True))
+    return when, theta1, theta2
+
+
+def _check_header(header: list[str], path: Path) -> list[str]:
+    """Which of the angles a file has; refuses one without times or angles, and repeated columns."""
     present = [name for name in _COLUMNS if f"{name}_deg" in header]
     missing = "time_s" if "time_s" not in header else "" if present else "theta1_deg or theta2_deg"
     if missing:
@@ -129,39 +157,7 @@ def load_angles(path: str | Path | Any) -> tuple[np.ndarray, np.ndarray | None, 
             raise ValueError(
                 f"{path} must have one column {name}, got {header.count(name)}: keep one of them"
             )
-    for row, line in zip(rows, lines, strict=True):
-        if len(row) != len(header):
-            raise ValueError(
-                f"row {line} of {path} must have {len(header)} cells, got {len(row)}: mend the row"
-            )
-    body, lines = rows[1:], lines[1:]
-
-    def numbers(name: str, gaps: bool) -> np.ndarray:
-        place = header.index(name)
-        return np.array(
-            [
-                _cell(row[place], name, line, path, gaps)
-                for row, line in zip(body, lines, strict=True)
-            ]
-        )
-
-    when = numbers("time_s", False)
-    values = np.full((2, when.size), np.nan)
-    for i, name in enumerate(_COLUMNS):
-        if name in present:
-            values[i] = np.radians(numbers(f"{name}_deg", True))
-    names = {"times": "time_s", **{name: f"{name}_deg" for name in _COLUMNS}}
-    there = [name in present for name in _COLUMNS]
-    _check(
-        Angles(when, values),
-        there,
-        lambda name, i: f"{names[name]} in row {lines[i]} of {path}",
-        "in degrees",
-    )
-    theta1, theta2 = (
-        column if column_there else None for column, column_there in zip(values, there, strict=True)
-    )
-    return when, theta1, theta2
+    return present
 
 
 def _rows(path: Path) -> tuple[list[list[str]], list[int]]:

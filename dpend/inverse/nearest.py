@@ -115,14 +115,16 @@ def _nearest(problem: DesignProblem, look: Look, most: int) -> tuple[Look, int, 
 
 def _polish(problem: DesignProblem, look: Look) -> Look | None:
     """The look after Newton's shortest step, or the one before if rounding makes it worse; None if
-    this is not near a nearest solution: the step is long, or |x| falls along the solutions.
+    this is not near a nearest solution: bounds keep the step from one, the step is long, or |x|
+    falls along the solutions.
     """
     inside = (look.x > problem.low) & (look.x < problem.high)
     jacobian, step = look.jacobian[:, inside], np.zeros_like(look.x)
     step[inside] = np.linalg.lstsq(jacobian, -look.value, rcond=None)[0]
     x = look.x[inside]
     slope = x - jacobian.T @ np.linalg.lstsq(jacobian.T, x, rcond=None)[0]
-    if not np.all(np.abs(look.value + look.jacobian @ step) <= _NEAR * (1 + np.abs(look.value))):
+    scale = np.sum(np.abs(look.jacobian[:, problem.free]), axis=1)
+    if not np.all(np.abs(look.value + look.jacobian @ step) <= _NEAR * scale):
         return None
     if not max(np.max(np.abs(step)), np.max(np.abs(slope), initial=0.0)) <= _NEAR:
         return None
