@@ -43,20 +43,6 @@ _FACTOR = 10.0
 _LARGEST_ANGLE = math.pi * (1 - 1e-12)
 # Without bounds of its own, theta1 does not exceed this.
 _LARGEST_WITHOUT_BOUNDS = 0.999 * math.pi
-_MESSAGES = {
-    Status.CONVERGED: "Found.",
-    Status.MAX_ITERATIONS: "The search did not converge in the allowed iterations, or stalled: "
-    "start from the pendulum "
-    "it came to.",
-    Status.LEFT_BRANCH: "The search was stopped where the branch cannot be followed to this "
-    "release: change the start, "
-    "or the bounds.",
-    Status.NO_SUCH_ORBIT: "The search was stopped where the branch ends without reaching this "
-    "release: change the "
-    "start, or the bounds.",
-    Status.NO_SOLUTION: "No solution was found within the bounds: the least sum of squares near "
-    "the start is returned.",
-}
 
 
 @jax.tree_util.register_dataclass

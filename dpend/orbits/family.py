@@ -99,9 +99,10 @@ class Family:
 
         An orbit released at (-theta1, -theta2) counts; where the curve has it, the mirror image is
         returned. Derivatives with respect to `theta1`, and to the pendulum that `follow_family` was
-        given, are those of the root (implicit function theorem): one linear solve and no walk. The
-        walk needs numbers, so that `jax.grad`, `jax.jacfwd` and their like work, and `jax.jit`
-        around it does not.
+        given, are those of the root (implicit function theorem): one linear solve and no walk.
+        Second ones are forward derivatives of these, as `jax.hessian` takes them. The walk needs
+        numbers, so that `jax.grad`, `jax.jacfwd` and their like work, and `jax.jit` around it does
+        not.
 
         Arguments:
             theta1: release angles of the upper rod [rad], any shape.

@@ -211,14 +211,16 @@ def find_orbit(
       swings to the first orbit with |theta1|. An orbit released at (-theta1, -theta2) counts: it is
       the same one, half a period later.
     - `guess`: start from (theta2, period) and take what Newton's method finds, reduced to its
-      minimal period.
+      minimal period. The orbit is solved in one piece, and two doubles do not determine a motion
+      that grows by more than 1e16 on its way: beyond |kappa| = 1e30 or so this may fail where
+      `branch` and `Family.at`, whose orbits are known at 16 places, do not.
     - `ratio` alone: of the orbits with theta2 = ratio theta1 on the in-phase (+1) or anti-phase
       (-1) branch, or on `branch`, the one nearest to `theta1`, which is then an unknown too; with
       `guess`, the one near it.
 
     Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
-    and the pendulum are those of the root itself (implicit function theorem); with `jit`, `vmap`
-    and `grad` all works, and what is wrong with a traced argument shows in `status`.
+    and the pendulum are those of the root itself (implicit function theorem), second ones as
+    `jax.hessian` takes them; with `jit`, `vmap` and `grad` all works, and what is wrong with a traced argument shows in `status`.
 
     Arguments:
         theta1: release angle of the upper rod [rad].
@@ -231,8 +233,9 @@ def find_orbit(
         crossing: which of the branch's passages through `theta1`, in order of arclength.
         turn: how far the fastest motion may advance in one integration step [rad]; 0.1 leaves
             little but rounding.
-        tolerance: on the last Newton update, of theta2 [rad] relative to an amplitude below 1, and
-            of log T. 1e-13 is where rounding begins.
+        tolerance: on the Newton update after the last one made, of theta2 [rad] relative to an
+            amplitude below 1, and of log T. 1e-13 is where rounding begins. On a branch that update
+            is taken as the square of the last.
         max_iterations: Newton iterations at most, at least 1, which is to evaluate the guess.
         error: solve again at half the step for `error_estimate`; without it that is NaN.
     Returns:

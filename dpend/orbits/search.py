@@ -23,9 +23,15 @@ _LONGEST_STEP = 0.25
 _PIECES = 16
 # Halvings of a piece, down to the last place of a share.
 _HALVINGS = 50
-# A search gives up after so many points, attempts, and steps of all segments in Newton iterations.
-# The last number stands for WORK_SECONDS; searches that end well need WORK_NEEDED.
-_MOST_POINTS, _MOST_ATTEMPTS, _MOST_WORK = 5000, 15_000, 1_000_000
+# A search gives up after so many points or attempts.
+_MOST_POINTS, _MOST_ATTEMPTS = 5000, 15_000
+# It gives up after so many steps of a segment, summed over Newton's iterations: about half a minute
+# on one core (13 microseconds each at m2/m1 = 1e7). At m2/m1 = 1 a search needs 100 to 1000 of
+# them, at 1e3 some 20 000.
+_MOST_WORK = 2_000_000
+# The square of an update is the next one, to this factor squared: with a tolerance of 1e-13
+# Newton's method ends where it does on the walk.
+_LAST_UPDATE = TOLERANCE / 1e-13**0.5
 # Where a search stands, as a status that is none yet: on its way, or at the wanted release.
 _WALKING, _LOCATED = -1, -2
 
@@ -232,7 +238,3 @@ def last_aim(turn: Scalar, tolerance: Scalar, max_iterations: Scalar) -> Aim:
     """
     steps = TURN / turn
     return Aim(None, None, steps, _LAST_UPDATE * jnp.sqrt(tolerance), 1.0, max_iterations)
-
-
-# The square of an update is the next one, to this factor squared: with 1e-13 asked, `TOLERANCE`.
-_LAST_UPDATE = TOLERANCE / 1e-13**0.5

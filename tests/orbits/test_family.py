@@ -407,8 +407,6 @@ def test_derivatives_that_do_not_exist():
     first, second, third = (family.at(0.2, crossing=k) for k in (1, 2, 3))
     assert first.theta2 < second.theta2 < third.theta2 or first.period < second.period
     assert family.at(0.2, crossing=4).status == Status.NO_SUCH_ORBIT
-    with pytest.raises(ValueError, match="twice"):
-        jax.grad(jax.grad(lambda theta1: family.at(theta1).period))(0.1)
     with pytest.raises(ValueError, match="traced by jit"):
         jax.jit(lambda theta1: family.at(theta1).period)(0.1)
 
@@ -663,3 +661,13 @@ def test_families_of_other_pendulums(lengths, masses, branch):
         orbit = single(orbits, i)
         if orbit.log_abs_kappa < 15:
             np.testing.assert_allclose(np.sin(motion(orbit)[:2, 14]), 0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_second_derivatives_on_a_family(paper):
+    """The same as those of `find_orbit`, which differences confirm."""
+    family = dpend.follow_family(paper, "in-phase")
+    bend = jax.hessian(lambda theta1: family.at(theta1).period)(0.7)
+    first, nudge = jax.grad(lambda theta1: family.at(theta1).period), 1e-4
+    numeric = (first(0.7 + nudge) - first(0.7 - nudge)) / (2 * nudge)
+    np.testing.assert_allclose(bend, numeric, rtol=1e-6)

@@ -3,6 +3,7 @@ differences.
 """
 
 import itertools
+import time
 from functools import partial
 
 import extended
@@ -364,6 +365,29 @@ def test_extreme_mass_ratios(mass):
             missed = max(abs(back.state.theta1[0]), abs(back.state.theta2[0]))
             # Both integrations' own errors, grown as the motion grows.
             assert missed < 1e-9 + 10 * back.error_estimate + 1e-10 * abs(orbit.kappa) ** 0.5
+
+
+@pytest.mark.parametrize("theta1", [3.0, pytest.param(3.14, marks=pytest.mark.slow)])
+def test_a_branch_is_reached_as_far_as_its_family(theta1):
+    """Where kappa is beyond 1e30, and shooting in one piece sees noise."""
+    pendulum = Pendulum(1.0, 1.0, 1.0, 1e-3, 1.0)
+    orbit = dpend.find_orbit(pendulum, theta1, branch="in-phase")
+    assert orbit.status == Status.CONVERGED
+    assert orbit.log_abs_kappa > (90 if theta1 > 3.1 else 40)
+    same = dpend.follow_family(pendulum, "in-phase").at(theta1)
+    for name in ("theta2", "period"):
+        error = sum(x.error_estimate[name == "period"] for x in (orbit, same))
+        assert abs(getattr(orbit, name) - getattr(same, name)) < 3 * error
+    np.testing.assert_allclose(orbit.log_abs_kappa, same.log_abs_kappa, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_search_without_end_gives_up():
+    """At m2/m1 = 1e7 no step is long enough to get anywhere: the search says so, and soon."""
+    begin = time.perf_counter()
+    orbit = dpend.find_orbit(Pendulum(m2=1e6), np.radians(40), branch="in-phase")
+    assert orbit.status == Status.LEFT_BRANCH
+    assert time.perf_counter() - begin < 240
 
 
 @pytest.mark.parametrize(
