@@ -286,10 +286,10 @@ def fold(
 def _run(
     update: Callable[..., Any],
     start: tuple[State | None, Any],
-    pendulum: Pendulum,
-    state: State,
+    pendulum: Pendulum | Any,
+    state: State | Any,
     duration: Scalar,
-    scheme: Scheme,
+    scheme: Scheme | Any,
 ) -> tuple[State, State | None, Any]:
     """`_accumulate` behind the checks, compiled for a known number of steps or for any."""
     require_float64()
