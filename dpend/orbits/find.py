@@ -220,7 +220,8 @@ def find_orbit(
 
     Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
     and the pendulum are those of the root itself (implicit function theorem), second ones as
-    `jax.hessian` takes them; with `jit`, `vmap` and `grad` all works, and what is wrong with a traced argument shows in `status`.
+    `jax.hessian` takes them; with `jit`, `vmap` and `grad` all works, and what is wrong with a
+    traced argument shows in `status`.
 
     Arguments:
         theta1: release angle of the upper rod [rad].
