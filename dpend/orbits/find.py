@@ -220,7 +220,8 @@ def find_orbit(
 
     Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
     and the pendulum are those of the root itself (implicit function theorem), second ones as
-    `jax.hessian` takes them; with `jit`, `vmap` and `grad` all works, and what is wrong with a traced argument shows in `status`.
+    `jax.hessian` takes them; with `jit`, `vmap` and `grad` all works, and what is wrong with a
+    traced argument shows in `status`.
 
     Arguments:
         theta1: release angle of the upper rod [rad].
@@ -289,17 +290,21 @@ def find_orbit(
     return replace(centred, iterations=orbit.iterations + centred.iterations)
 
 
-def _check_request(  # type: ignore[no-untyped-def]
-    pendulum: Pendulum | Any, theta1: Scalar, branch, guess, symmetry, ratio, crossing
+def _check_request(
+    pendulum: Pendulum | Any,
+    theta1: Scalar,
+    branch: Any,
+    guess: Any,
+    symmetry: Any,
+    ratio: Any,
+    crossing: int,
 ) -> None:
     """Refuses what cannot be asked, as far as the values are known before tracing."""
     check_pendulum(pendulum)
-    for name, value, words in (
-        ("branch", branch, BRANCHES),
-        ("symmetry", symmetry, RELEASED_SYMMETRIES),
-    ):
+    words = ("branch", branch, BRANCHES), ("symmetry", symmetry, RELEASED_SYMMETRIES)
+    for name, value, known in words:
         if value is not None:
-            one_of(name, value, words)
+            one_of(name, value, known)
     if ratio is not None:
         one_of("ratio", ratio, (1, -1))
     at_most_one(branch=branch, guess=guess)
@@ -313,6 +318,20 @@ def _check_request(  # type: ignore[no-untyped-def]
         )
     if crossing > 1 and (branch is None or ratio is not None):
         raise ValueError(f"crossing must be 1 but with branch alone, got {crossing}: leave it out")
+    _check_release(pendulum, theta1)
+    angle1 = known_value(theta1)
+    if guess is not None:
+        _check_guess(guess, angle1)
+    elif angle1 is not None and _multiple_of_pi(angle1):
+        raise ValueError(
+            f"theta1 must not be a multiple of 180 degrees on a branch, got "
+            f"{math.degrees(angle1):g} degrees: "
+            "the branches pass there only in equilibrium"
+        )
+
+
+def _check_release(pendulum: Pendulum, theta1: Scalar) -> None:
+    """Refuses an angle that is none, and a pendulum that does not swing."""
     for name, value in {"theta1": theta1, **vars(pendulum)}.items():
         single(name, value)
     gravity, angle1 = known_value(pendulum.g), known_value(theta1)
@@ -322,23 +341,16 @@ def _check_request(  # type: ignore[no-untyped-def]
         raise ValueError(
             f"g must be positive for an orbit, got {gravity:g}: nothing swings back without gravity"
         )
-    if guess is None:
-        if angle1 is not None and _multiple_of_pi(angle1):
-            raise ValueError(
-                f"theta1 must not be a multiple of 180 degrees on a branch, got "
-                f"{math.degrees(angle1):g} degrees: "
-                "the branches pass there only in equilibrium"
-            )
-        return
+
+
+def _check_guess(guess: Any, angle1: float | None) -> None:
+    """Refuses a guess that is an equilibrium or has no period."""
     theta2, period = (known_value(value) for value in _guessed(guess))
     if period is not None and not period > 0:
         raise ValueError(f"period must be positive [s], got {period:g}: give another guess")
-    if (
-        angle1 is not None
-        and theta2 is not None
-        and _multiple_of_pi(angle1)
-        and _multiple_of_pi(theta2)
-    ):
+    if angle1 is None or theta2 is None:
+        return
+    if _multiple_of_pi(angle1) and _multiple_of_pi(theta2):
         raise ValueError(
             f"theta2 must not be a multiple of 180 degrees with theta1 at {math.degrees(angle1):g} "
             f"degrees, "

@@ -2,8 +2,8 @@
 
 A root of F(root, parameters) = 0 moves by d root = -(dF/d root)^-1 (dF/d parameters) d parameters.
 One rule serves the equations of segments and those of shooting in one piece. Its own Jacobians may
-be differentiated forwards again: second derivatives are `jax.hessian`'s. The parameters are l2/l1, m2/m1 and the value of what is held fixed at the release, in
-natural units.
+be differentiated forwards again: second derivatives are `jax.hessian`'s. The parameters are l2/l1,
+m2/m1 and the value of what is held fixed at the release, in natural units.
 """
 
 from collections.abc import Callable
