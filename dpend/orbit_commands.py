@@ -14,7 +14,12 @@ import typer
 
 import dpend
 from dpend.catalogue import survey
-from dpend.catalogue.atlas import MOST_SEARCH_STEPS, SECONDS_PER_STEP, expected_steps, known_period
+from dpend.catalogue.release import (
+    MOST_SEARCH_STEPS,
+    SECONDS_PER_STEP,
+    expected_steps,
+    known_period,
+)
 from dpend.checks import check_place, number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.options import (

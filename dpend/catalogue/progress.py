@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dpend.catalogue.atlas import BEYOND
 from dpend.catalogue.files import check_least, check_record, check_type
+from dpend.catalogue.release import BEYOND
 from dpend.catalogue.track import Track
 from dpend.records import json_text, parse_json, read_text, replacing
 
