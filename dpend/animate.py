@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from dpend.checks import check_place, file_path, function, instance, known_number, shown
+from dpend.checks import function, instance, known_number, shown
 from dpend.mechanics.pendulum import (
     Pendulum,
     State,
@@ -24,8 +24,8 @@ from dpend.mechanics.pendulum import (
     positions,
 )
 from dpend.motion.simulate import Trajectory, simulate
+from dpend.places import check_place, file_path, replacing
 from dpend.plots import LOWER, UPPER
-from dpend.records import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

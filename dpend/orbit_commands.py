@@ -20,7 +20,7 @@ from dpend.catalogue.release import (
     expected_steps,
     known_period,
 )
-from dpend.checks import check_place, number
+from dpend.checks import number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.options import (
     Report,
@@ -35,7 +35,7 @@ from dpend.options import (
 )
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
-from dpend.records import replacing
+from dpend.places import check_place, replacing
 from dpend.report import (
     converged,
     design_record,

@@ -14,7 +14,7 @@ import dpend
 # in its own wing.
 # The public names, `dpend` itself, come last but for the doors, which draw, print and serve.
 ORDER = """
-_version _runtime checks status records
+_version _runtime checks places status records
 mechanics.trig mechanics.pendulum mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.scheme
 motion.integrate motion.estimate motion.simulate motion.reference motion.root motion.events

@@ -26,7 +26,8 @@ from dpend.catalogue.table import (
 )
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.orbit import RELEASED_SYMMETRIES
-from dpend.records import file_name, parse_json, read_text, units_of
+from dpend.places import read_text
+from dpend.records import file_name, parse_json, units_of
 from dpend.status import Status
 
 # Names of the pendulum's fields in a file.

@@ -41,11 +41,12 @@ from dpend.catalogue.release import (
 from dpend.catalogue.scan import MOTIONS_PER_WAVE, Budget, Zero
 from dpend.catalogue.table import stacked
 from dpend.catalogue.track import NEAR, STEP, STEPS_PER_POINT, Track, partnerless, without_pairs
-from dpend.checks import check_place, file_path, function, known_number
+from dpend.checks import function, known_number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.family import follow_family
 from dpend.orbits.find import find_orbit, swinging_pendulum
 from dpend.orbits.orbit import PeriodicOrbit
+from dpend.places import check_place, file_path
 from dpend.status import Status
 
 # Doublings of the slices before the search may end.
