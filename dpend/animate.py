@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from dpend.checks import check_place, file_path, function, instance, known_number, shown
+from dpend.checks import function, instance, known_number, shown
 from dpend.mechanics.pendulum import (
     Pendulum,
     State,
@@ -24,13 +24,13 @@ from dpend.mechanics.pendulum import (
     positions,
 )
 from dpend.motion.simulate import Trajectory, simulate
+from dpend.places import check_place, file_path, replacing
 from dpend.plots import LOWER, UPPER
-from dpend.records import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Told after each frame how many are drawn, and of how many.
+# Called after each frame with how many are drawn, and of how many.
 Progress: TypeAlias = Callable[[int, int], None]
 
 # Okabe and Ito's palette, told apart by the colour-blind; its yellow is too pale for a line on
@@ -39,14 +39,15 @@ COLOURS = (UPPER, LOWER, "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 # GIFs tell time in hundredths of a second, and 25 a second is the fastest rate in whole ones that
 # players keep.
 FRAMES_PER_SECOND = 25
-# In one step the fast mode advances by this [rad]: order 8 is then right far below a pixel, for as
+# The fast mode advances by this in a step [rad]. Order 8 is then right far below a pixel, for as
 # long as the motion can be known at all, and all releases share one compiled program.
 _TURN = 0.05
 # Saved times in a frame: the trail is then a curve, not a polygon.
 _SAVED = 4
 # How much of the lower bob's way trails behind it [s].
 _TRAIL = 0.6
-_PIXELS = 480  # a multiple of 16, as video codecs want it
+# Pixels along a side: a multiple of 16, as video codecs want it.
+_PIXELS = 480
 # Beyond this a GIF is hundreds of megabytes, and no one waits for it.
 _MOST_FRAMES = 10_000
 # Half a minute of computing for each release; only a few of its states are saved.
@@ -81,6 +82,25 @@ def motions_for(
     check_pendulum(pendulum)
     interval = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
     duration = known_number("duration", duration, positive=True, unit="s")
+    frames = _count_frames(duration, interval, speed)
+    substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
+    steps = frames * _SAVED * (substeps + 1)
+    if not steps <= _MOST_STEPS:
+        raise ValueError(
+            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got "
+            f"{duration:g} s, which takes {steps:.3g}: give a shorter one, or another pendulum"
+        )
+    every = max(1, math.ceil(substeps))
+    step = interval / (_SAVED * every)
+    end, most = frames * interval, 2 * _MOST_STEPS
+    return [
+        simulate(pendulum, one, end, step=step, save_every=every, most_steps=most)
+        for one in releases
+    ]
+
+
+def _count_frames(duration: float, interval: float, speed: float) -> int:
+    """The frames of a film, `interval` apart in the motion [s]; refuses none and too many."""
     if not interval <= duration:
         raise ValueError(
             f"speed must show the motion of {duration:g} s for a frame at least, got {speed:g}: "
@@ -92,22 +112,7 @@ def motions_for(
             f"duration must give at most {_MOST_FRAMES} frames, got {count:.3g}: give a shorter "
             f"one, or a higher speed"
         )
-    frames = math.ceil(count - 1e-9)
-    substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
-    steps = frames * _SAVED * (substeps + 1)
-    if not steps <= _MOST_STEPS:
-        raise ValueError(
-            f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got "
-            f"{duration:g} s, which takes "
-            f"{steps:.3g}: give a shorter one, or another pendulum"
-        )
-    every = max(1, math.ceil(substeps))
-    step = interval / (_SAVED * every)
-    end, most = frames * interval, 2 * _MOST_STEPS
-    return [
-        simulate(pendulum, one, end, step=step, save_every=every, most_steps=most)
-        for one in releases
-    ]
+    return math.ceil(count - 1e-9)
 
 
 def film(
@@ -123,7 +128,7 @@ def film(
     fading into the past.
 
     Arguments:
-        progress: told after each frame how many are drawn, and of how many.
+        progress: called after each frame with how many are drawn, and of how many.
     Raises:
         ValueError: another suffix, no such directory, no motions, or motions with different times.
         RuntimeError: .mp4 without imageio-ffmpeg.
@@ -176,6 +181,7 @@ def _joints(pendulum: Pendulum, motion: Trajectory) -> np.ndarray:
 
 
 def _count(motions: Sequence[Trajectory]) -> int:
+    """Frames of a film."""
     return (motions[0].time.size - 1) // _SAVED + 1
 
 

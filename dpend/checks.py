@@ -1,13 +1,10 @@
 """What is refused at the door: bad arguments, with one error text for each kind."""
 
 import math
-import os
 import reprlib
-import tempfile
 from collections.abc import Sequence
 from decimal import Decimal
 from numbers import Integral, Number, Real
-from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import jax
@@ -17,6 +14,9 @@ from jax import lax
 
 from dpend._runtime import require_float64
 
+# A float64 scalar, or an array where a class holds many at once; transformations also pass tracers
+# and placeholders.
+Scalar: TypeAlias = Any
 Choice = TypeVar("Choice", str, int)
 
 # Beyond it float64, in which lanes are counted, has no neighbouring integers.
@@ -30,11 +30,9 @@ _SHORTENED.maxstring = _SHORTENED.maxother = _LONGEST
 def shown(value: Any) -> str:
     """A value as errors show it: short, on one line, whatever it is."""
     if isinstance(value, (float, np.generic, np.ndarray, jax.Array)) and not is_traced(value):
-        text = (
-            np.array2string(np.asarray(value), threshold=6, edgeitems=2)
-            if np.ndim(value)
-            else str(value)
-        )
+        text = str(value)
+        if np.ndim(value):
+            text = np.array2string(np.asarray(value), threshold=6, edgeitems=2)
     else:
         try:
             text = _SHORTENED.repr(value)
@@ -60,13 +58,13 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
     if isinstance(value, float):  # the usual one, NumPy's float64 among them
         return np.float64(value)
     if isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.timedelta64)):
-        return _rounded(name, value, wanted)
+        return _to_float64(name, value, wanted)
     if not isinstance(value, (np.ndarray, jax.Array, jax.ShapeDtypeStruct)) and hasattr(
         value, "__array__"
     ):
         value = np.asarray(value)  # of another library
     kind = getattr(value, "dtype", None)
-    if kind is None or not (jnp.issubdtype(kind, np.floating) or np.dtype(kind).kind in "iu"):
+    if not _is_real_type(kind):
         raise ValueError(f"{name} must be {wanted}, got {shown(value)}: give a number")
     if isinstance(value, np.ndarray):
         return value.astype(np.float64, copy=False) if value.ndim else np.float64(value)
@@ -76,7 +74,14 @@ def real(name: str, value: Any, *, wanted: str = "a real number") -> Any:
     return value
 
 
-def _rounded(name: str, value: Any, wanted: str) -> np.float64:
+def _is_real_type(kind: Any) -> bool:
+    """Whether a type of arrays holds real numbers, also floats of JAX that NumPy does not have."""
+    return kind is not None and (
+        bool(jnp.issubdtype(kind, np.floating)) or np.dtype(kind).kind in "iu"
+    )
+
+
+def _to_float64(name: str, value: Any, wanted: str) -> np.float64:
     """An integer, a fraction or a decimal number as float64."""
     try:
         known = float(value)
@@ -91,19 +96,16 @@ def _rounded(name: str, value: Any, wanted: str) -> np.float64:
 def number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> Any:
     """A finite number as float64; an array, also a traced one, as an array of float64.
 
-    Single numbers are looked at wherever they are known, and what has to be positive in arrays too.
-    In an array of many a NaN may stand for what is not known.
+    Single numbers are checked wherever they are known; arrays only for being positive. In an array
+    a NaN may stand for a value that is not known.
 
     Raises:
         ValueError: as `real`; NaN or an infinity; with `positive` what is not above zero.
     """
     wanted = f"a finite {'positive ' if positive else ''}number" + (f" [{unit}]" if unit else "")
     value = real(name, value, wanted=wanted)
-    if (
-        isinstance(value, jax.ShapeDtypeStruct)
-        or is_traced(value)
-        or not (positive or value.ndim == 0)
-    ):
+    unknown = isinstance(value, jax.ShapeDtypeStruct) or is_traced(value)
+    if unknown or (value.ndim and not positive):
         return value
     if value.ndim:
         wrong = bool(np.any(np.asarray(value) <= 0))
@@ -115,10 +117,10 @@ def number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> 
 
 
 def coordinate(name: str, value: Any, *, unit: str) -> Any:
-    """A coordinate of a state as float64: a finite number, or an array that JAX has computed, which
-    may hold a NaN.
+    """A coordinate of a state as float64: a finite number, or an array that JAX has computed.
 
-    Where a motion was lost its end is NaN, and what goes on from there says so by its status.
+    Such an array may hold NaN: where a motion was lost, its end is NaN, and the status of what
+    starts there says so.
 
     Raises:
         ValueError: as `number`.
@@ -183,8 +185,7 @@ def known_real(name: str, value: Any, *, unit: str = "") -> float:
 
 
 def known_number(name: str, value: Any, *, positive: bool = False, unit: str = "") -> float:
-    """The finite number of an argument that decides what is computed, and that no derivative goes
-    through.
+    """The finite number of an argument that decides what is computed; it has no derivative.
 
     Raises:
         ValueError: as `number`; an array, or a value traced by `jit` or a derivative.
@@ -227,10 +228,8 @@ def numbers(name: str, values: Any, *, unit: str = "", gaps: bool = False) -> np
     try:
         array = np.asarray(values)
         if array.dtype == object:  # integers beyond 64 bits, fractions, gaps
-            cells = [
-                np.nan if gaps and cell is None else real(name, cell) for cell in array.ravel()
-            ]
-            array = np.array(cells, np.float64).reshape(array.shape)
+            cells = (math.nan if gaps and x is None else real(name, x) for x in array.ravel())
+            array = np.array([*cells], np.float64).reshape(array.shape)
     except (TypeError, ValueError):
         array = np.empty(0, object)
     if array.dtype.kind not in "iuf":
@@ -239,23 +238,22 @@ def numbers(name: str, values: Any, *, unit: str = "", gaps: bool = False) -> np
 
 
 def arrays(name: str, tree: Any) -> None:
-    """Refuses a tree of which a leaf is no number and no array of numbers; complex numbers and
-    booleans are.
+    """Refuses a tree with a leaf that is no number and no array of numbers. Complex numbers and
+    booleans count as numbers.
 
     Raises:
         ValueError: text, objects, or integers beyond the range of float64 among its leaves.
     """
     for leaf in jax.tree.leaves(tree):
         kind = getattr(leaf, "dtype", None)
-        if kind is None and isinstance(leaf, Number) and not isinstance(leaf, (complex, bool)):
-            real(name, leaf)
-        elif not (
-            isinstance(leaf, Number) or (kind is not None and np.dtype(kind).kind not in "OSUMm")
-        ):
+        good = isinstance(leaf, Number) or (kind is not None and np.dtype(kind).kind not in "OSUMm")
+        if not good:
             raise ValueError(
                 f"{name} must be a tree of numbers and arrays, got {shown(leaf)} in it: give "
                 f"numbers"
             )
+        if kind is None and not isinstance(leaf, (complex, bool)):
+            real(name, leaf)
 
 
 def flag(name: str, value: Any) -> bool:
@@ -294,10 +292,8 @@ def at_most_one(**given: Any) -> None:
     """
     names = [name for name, value in given.items() if value is not None]
     if len(names) > 1:
-        values = " and ".join(shown(given[name]) for name in names)
-        raise ValueError(
-            f"{' and '.join(names)} exclude each other, got {values}: give one of them"
-        )
+        both, values = " and ".join(names), " and ".join(shown(given[name]) for name in names)
+        raise ValueError(f"{both} exclude each other, got {values}: give one of them")
 
 
 def text(name: str, value: Any) -> str:
@@ -351,53 +347,3 @@ def function(name: str, value: Any, of: str, like: str) -> None:
         raise ValueError(
             f"{name} must be a function of {of}, got {shown(value)}: give one like {like}"
         )
-
-
-def file_path(name: str, value: Any) -> Path:
-    """The path of a file or directory.
-
-    Raises:
-        ValueError: neither text nor a path, or one that no system has.
-    """
-    text = os.fspath(value) if isinstance(value, (str, os.PathLike)) else ""
-    if not isinstance(text, str) or not text or "\0" in text:
-        raise ValueError(f'{name} must be a path, got {shown(value)}: give one like "F.json"')
-    return Path(text)
-
-
-def unwritable(path: Path) -> str:
-    """Why no new file can be put beside `path`, in the system's words; empty if one can.
-
-    It is tried: permissions do not tell what the root user, a disk mounted for reading or the
-    system's own directories allow, nor how long a name may be.
-    """
-    try:
-        tempfile.NamedTemporaryFile(
-            prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent
-        ).close()
-    except OSError as error:
-        return error.strerror or str(error)
-    return ""
-
-
-def check_place(name: str, path: Path, suffixes: Sequence[str]) -> None:
-    """Refuses, before anything is computed, a file that could not be written after.
-
-    Raises:
-        ValueError: another suffix; no directory to write in. `name` is the argument that is told.
-    """
-    if path.suffix not in suffixes:
-        raise ValueError(
-            f"{name} must end in {' or '.join(suffixes)}, got {path}: give another name"
-        )
-    reason = "Is a directory" if os.path.isdir(path) else unwritable(path)
-    if reason:
-        raise ValueError(
-            f"{name} must be a file in a directory that can be written to, got {path} ({reason}): "
-            f"give another place"
-        )
-
-
-# A float64 scalar, or an array where a class holds many at once; transformations also pass tracers
-# and placeholders.
-Scalar: TypeAlias = Any

@@ -14,8 +14,13 @@ import typer
 
 import dpend
 from dpend.catalogue import survey
-from dpend.catalogue.atlas import MOST_SEARCH_STEPS, SECONDS_PER_STEP, expected_steps, known_period
-from dpend.checks import check_place, number
+from dpend.catalogue.release import (
+    MOST_SEARCH_STEPS,
+    SECONDS_PER_STEP,
+    expected_steps,
+    known_period,
+)
+from dpend.checks import number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.options import (
     Report,
@@ -30,7 +35,7 @@ from dpend.options import (
 )
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
-from dpend.records import replacing
+from dpend.places import check_place, replacing
 from dpend.report import (
     converged,
     design_record,

@@ -13,6 +13,7 @@ import numpy as np
 
 from dpend.checks import instance, integer, one_of, shown, single
 from dpend.inverse.fit import Fit
+from dpend.map_picture import LABELS, draw_map
 from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
 from dpend.motion.simulate import Trajectory, simulate
 from dpend.orbits.family import Family
@@ -27,19 +28,8 @@ UPPER, LOWER, NEUTRAL = "#0072B2", "#D55E00", "#555555"
 _STROBES = 13
 # The marks of a family's special points, by the beginning of their kind.
 _MARKS = {"resonance": "|", "fold": "^", "stability": "o"}
-# What a map's colour bar says, and whether its values span decades.
-_LABELS = {
-    "lyapunov": ("Lyapunov exponent (1/s)", False),
-    "exponent": ("Lyapunov exponent (1/s)", False),
-    "megno": ("time-averaged MEGNO", False),
-    "flip_time": ("time of the first flip (s)", True),
-    "energy_drift": ("energy drift (of its scale)", True),
-}
-# The quantiles of a map's values between which its colours lie.
-_QUANTILES = (0.005, 0.995)
-# Cells along a picture's side; of larger maps every n-th cell is drawn, more than a screen shows
-# anyway.
-_MOST_CELLS = 1500
+# Orbits are drawn as stable up to this log |kappa|, which is zero on stable ones but for rounding.
+_STABLE = 1e-9
 
 
 def _axes(ax: Any) -> "Axes":
@@ -218,7 +208,6 @@ def family(
     if not isinstance(label, str):
         raise ValueError(f'label must be text, got {shown(label)}: give one like "in phase"')
     ax = _axes(ax)
-
     side = np.sign(np.mean(curve.orbits.theta1))
 
     def where(orbits: PeriodicOrbit) -> tuple[Any, Any]:
@@ -227,26 +216,18 @@ def family(
         return np.asarray(orbits.energy), np.asarray(orbits.period)
 
     x, y = where(curve.orbits)
-    stable = np.asarray(curve.orbits.log_abs_kappa) <= 1e-9
+    stable = np.asarray(curve.orbits.log_abs_kappa) <= _STABLE
     # A piece between a stable and an unstable orbit is drawn as unstable, up to the point where
     # that changes.
     pieces = stable[:-1] & stable[1:]
-    ax.plot(x, y, color=colour, linestyle=(0, (4, 2)), linewidth=1.1)
     solid = np.append(pieces, False) | np.append(False, pieces)
+    ax.plot(x, y, color=colour, linestyle=(0, (4, 2)), linewidth=1.1)
     ax.plot(np.where(solid, x, np.nan), y, color=colour, linewidth=1.8, label=label or None)
+    hollow: dict[str, Any] = {"c": colour, "mfc": "white", "ms": 6, "ls": "none"}
     for start, mark in _MARKS.items():
-        spots = [
-            where(point.orbit) for point in curve.special_points if point.kind.startswith(start)
-        ]
-        if spots:
-            ax.plot(
-                *np.transpose(spots),
-                mark,
-                color=colour,
-                markerfacecolor="white",
-                markersize=6,
-                linestyle="none",
-            )
+        points = [point.orbit for point in curve.special_points if point.kind.startswith(start)]
+        if points:
+            ax.plot(*np.transpose([where(orbit) for orbit in points]), mark, **hollow)
     ax.set_xlabel("theta1 (deg)" if plane == "angles" else "energy (J)")
     ax.set_ylabel("theta2 (deg)" if plane == "angles" else "period (s)")
     return ax
@@ -270,7 +251,7 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
 
     instance("dataset", dataset, xarray.Dataset, "what dpend.sweep returns")
     names = [str(key) for key in dataset.data_vars]
-    first = next((key for key in names if key in _LABELS), names[0] if names else None)
+    first = next((key for key in names if key in LABELS), names[0] if names else None)
     name = one_of("name", first if name is None else name, names)
     field = dataset[name]
     if field.ndim != 2:
@@ -278,77 +259,8 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
             f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve"
         )
     ax = _axes(ax)
-    every = -(-max(field.shape) // _MOST_CELLS)
-    dataset = dataset.isel({dim: slice(None, None, every) for dim in field.dims})
-    across, up = dataset[name].dims
-    x, y = (_shown(dataset, key) for key in (across, up))
-    values, label, norm = _colours(dataset[name], name)
-    mesh = ax.pcolormesh(
-        x, y, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True
-    )
-    assert ax.figure is not None
-    ax.figure.colorbar(mesh, ax=ax, label=label, extend="both")
-    _label_axis(ax.xaxis, dataset, across)
-    _label_axis(ax.yaxis, dataset, up)
-    if {across, up} == {"theta1", "theta2"}:
-        if name == "flip_time":
-            _no_flip(dataset, ax, across)
-        ax.set_aspect("equal")
+    draw_map(ax, dataset, name)
     return ax
-
-
-def _colours(field: Any, name: str) -> tuple[np.ndarray, str, Any]:
-    """The values to draw, upwards along the first axis, what the colour bar says, and its scale.
-
-    The scale goes from one quantile to another: a few extreme cells would leave no colour to the
-    others.
-    """
-    from matplotlib.colors import LogNorm, Normalize
-
-    label, decades = _LABELS.get(name.removesuffix("_error"), (name, False))
-    if name.endswith("_error"):
-        label, decades = f"error: {label}", True
-    values = np.asarray(field.values, np.float64).T
-    values = np.where(np.isfinite(values), values, np.nan)
-    spread = values[np.isfinite(values) & ((values > 0) | (not decades))]
-    low, high = np.quantile(spread, _QUANTILES) if spread.size else (0.1, 1.0)
-    norm = (LogNorm if decades else Normalize)(low, max(high, low + 0.01 * abs(low)))
-    return np.where(decades & (values <= 0), low, values), label, norm
-
-
-def _label_axis(axis: Any, dataset: Any, key: str) -> None:
-    from matplotlib.ticker import MultipleLocator
-
-    if not key.startswith("theta"):
-        axis.set_label_text(f"{key} ({dataset[key].attrs.get('units', '')})")
-        return
-    axis.set_label_text(f"{key} (deg)")
-    span = np.ptp(_shown(dataset, key))
-    if span > 180:
-        axis.set_major_locator(MultipleLocator(90 if span > 270 else 45))
-
-
-def _shown(dataset: Any, key: str) -> np.ndarray:
-    values = np.asarray(dataset[key].values)
-    return np.degrees(values) if key.startswith("theta") else values
-
-
-def _no_flip(dataset: Any, ax: "Axes", across: str) -> None:
-    """The line inside which releases from rest lie below both saddles in which one rod points
-    upwards.
-    """
-    at = dataset.attrs
-    if at.get("at_p1") or at.get("at_p2") or not at["g"] > 0:
-        return
-    weight1, weight2 = (at["m1"] + at["m2"]) * at["l1"], at["m2"] * at["l2"]
-    theta1, theta2 = (_shown(dataset, key) for key in ("theta1", "theta2"))
-    height = (
-        -weight1 * np.cos(np.radians(theta1))[:, None]
-        - weight2 * np.cos(np.radians(theta2))[None, :]
-    )
-    saddle = -abs(weight1 - weight2)
-    arguments = (theta1, theta2, height.T) if across == "theta1" else (theta2, theta1, height)
-    ax.contour(*arguments, levels=[saddle], colors="black", linewidths=1.0)
 
 
 def residuals(fit: Fit | Any) -> "Figure":
@@ -375,22 +287,9 @@ def residuals(fit: Fit | Any) -> "Figure":
     )
     band = 2 * float(np.degrees(fit.noise))
     for (name, angle, left, colour, style), ax in zip(both, grid[1:], strict=True):
-        grid[0].plot(
-            fit.time,
-            np.degrees(angle),
-            color=colour,
-            linestyle=style,
-            linewidth=1.0,
-            label=f"{name}, fitted",
-        )
-        grid[0].plot(
-            fit.time,
-            np.degrees(angle + left),
-            ".",
-            color=colour,
-            markersize=3,
-            label=f"{name}, measured",
-        )
+        grid[0].plot(fit.time, np.degrees(angle), style, c=colour, lw=1.0, label=f"{name}, fitted")
+        measured = np.degrees(angle + left)
+        grid[0].plot(fit.time, measured, ".", c=colour, ms=3, label=f"{name}, measured")
         ax.axhspan(-band, band, color=NEUTRAL, alpha=0.15, linewidth=0)
         ax.axhline(0, color=NEUTRAL, linewidth=0.8)
         ax.plot(fit.time, np.degrees(left), ".", color=colour, markersize=3)

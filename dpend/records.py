@@ -1,31 +1,20 @@
 """What results look like outside Python: units on their fields, records for JSON, columns for CSV
-and xarray, and files that take the old one's place only when whole.
+and xarray.
 
 Degrees in files and on the command line, radians in Python and in xarray; the unit of a field says
 which name and which number that makes.
 """
 
-import contextlib
 import dataclasses
 import functools
 import json
 import math
-import os
 import re
-import stat
-import tempfile
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpend.status import Status, message
-
-# The largest file that is read [bytes]: nearly half a million orbits as JSON, or five million
-# measured samples. Parsing takes about ten times as much memory, 2.5 GB.
-LARGEST_FILE = 1 << 28
-
 
 # How a unit ends a name in files, where angles are in degrees.
 _SUFFIXES = {
@@ -121,57 +110,6 @@ def variables(result: Any, dim: str) -> tuple[dict[str, Any], dict[str, Any]]:
         if units[name] == "rad"
     }
     return data, degrees
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`, which takes its place if all goes well: a file that is there,
-    old or new, is always whole.
-    """
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    try:
-        yield Path(name)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
-
-
-def read_text(path: Path) -> str:
-    """The text of a file that a user names, which is refused unread if it has no end.
-
-    A pipe, a device, or a file that the system makes up while it is read has no size to check. The
-    file is opened so that nothing waits for a writer, and no more is read than its size.
-
-    Raises:
-        OSError: it cannot be opened or read.
-        ValueError: no regular file, one above `LARGEST_FILE`, one that changes meanwhile, or text
-            that is not UTF-8.
-    """
-    _check_size(os.stat(path))
-    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    with open(handle, "rb") as file:
-        size = _check_size(os.fstat(handle))
-        data = file.read(size + 1)
-    if len(data) != size:
-        raise ValueError(
-            f"it has {size} bytes and gives {'more' if len(data) > size else len(data)}"
-        )
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"byte {error.start} is no UTF-8 text") from None
-
-
-def _check_size(status: os.stat_result) -> int:
-    if not stat.S_ISREG(status.st_mode):
-        raise ValueError("it is no regular file")
-    if status.st_size > LARGEST_FILE:
-        sizes = (f"{size / 1e6:.0f} MB" for size in (status.st_size, LARGEST_FILE))
-        raise ValueError("it has {}, above the limit of {}".format(*sizes))
-    return status.st_size
 
 
 def parse_json(text: str) -> Any:

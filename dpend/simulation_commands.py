@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 import dpend
-from dpend.checks import check_place, number
+from dpend.checks import number
 from dpend.maps.cost import Cost
 from dpend.maps.store import check_store
 from dpend.mechanics.pendulum import Pendulum, State
@@ -31,6 +31,7 @@ from dpend.options import (
     radians,
     size_in,
 )
+from dpend.places import check_place
 from dpend.report import (
     converged,
     fit_record,

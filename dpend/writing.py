@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import dpend
-from dpend.checks import check_place
 from dpend.motion.simulate import Trajectory
-from dpend.records import columns, json_text, replacing
+from dpend.places import check_place, replacing
+from dpend.records import columns, json_text
 
 
 def writer(path: Path) -> Callable[[Trajectory], None]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-import dpend.catalogue.atlas
+import dpend.catalogue.release
 import dpend.catalogue.scan
 from dpend import cli, report, terminal, writing
 
@@ -542,7 +542,7 @@ def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
         result = dpend.catalogue.scan.scanned(*arguments)
         return dataclasses.replace(result, zeros=result.zeros[1:])
 
-    monkeypatch.setattr(dpend.catalogue.atlas, "scanned", forgetful)
+    monkeypatch.setattr(dpend.catalogue.release, "scanned", forgetful)
     status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
     assert (status, len(found["orbits"]), found["coverage"]["suspicious_cells"]) == (1, 4, 1)
 

@@ -30,7 +30,7 @@ import dpend.animate
 import dpend.chaos
 import dpend.plots
 from dpend import Pendulum, Scheme, State
-from dpend.catalogue.atlas import stacked
+from dpend.catalogue.table import stacked
 
 HUGE = 10**400
 PAPER, RELEASE, FINE = Pendulum(), dpend.released(0.5, 0.7), Scheme("rk8", 1e-2)
@@ -586,7 +586,7 @@ DOORS = {
             "most_steps": POSITIVE,
             "progress": PROGRESS,
         },
-        "dpend.catalogue.atlas.expected_steps",
+        "dpend.catalogue.release.expected_steps",
     ),
     "find_brake_families": Door(
         dpend.find_brake_families,

@@ -14,7 +14,7 @@ import dpend
 # in its own wing.
 # The public names, `dpend` itself, come last but for the doors, which draw, print and serve.
 ORDER = """
-_version _runtime checks status records
+_version _runtime checks places status records
 mechanics.trig mechanics.pendulum mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.scheme
 motion.integrate motion.estimate motion.simulate motion.reference motion.root motion.events
@@ -24,12 +24,12 @@ maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.crossings orbits.special
 orbits.find orbits.family
-catalogue.bicubic catalogue.rows catalogue.scan catalogue.files catalogue.atlas catalogue.track
-catalogue.progress catalogue.entries catalogue.survey
+catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
+catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-plots animate report writing terminal options orbit_commands simulation_commands cli
+map_picture plots animate report writing terminal options orbit_commands simulation_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.

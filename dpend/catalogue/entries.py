@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 
-from dpend.catalogue.atlas import table_of
+from dpend.catalogue.table import table_of
 from dpend.orbits.family import Family
 from dpend.orbits.special import SpecialPoint
 from dpend.status import Status

@@ -1,9 +1,7 @@
-"""The file of an atlas: its columns and units, and what every row of a true one satisfies.
+"""The file of an atlas, F.csv or F.json: what it says, and where it is no such file.
 
-A table that was damaged on its way is refused, with the row and the column. The columns depend on
-each other, and that tells most damages: the energy is that of either rest, `log_abs_kappa` is the
-logarithm of kappa, the dual of a centred orbit follows from its release, and neighbours on a family
-lie no further apart than arclength allows.
+A table that was damaged on its way is refused, with the row and the column: each cell and each
+record must have its form, and all must agree (see `table`).
 """
 
 import csv
@@ -11,80 +9,30 @@ import io
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from dpend.catalogue.table import (
+    COLUMNS,
+    LONGEST,
+    SHORTEST,
+    UNITS,
+    Table,
+    TableCheck,
+    column_name,
+)
 from dpend.mechanics.pendulum import Pendulum
-from dpend.orbits.arc import SEGMENTS
 from dpend.orbits.orbit import RELEASED_SYMMETRIES
-from dpend.records import file_name, parse_json, read_text, units_of
+from dpend.places import read_text
+from dpend.records import file_name, parse_json, units_of
 from dpend.status import Status
 
-# Energies are compared in units of the weights' torques. That of the release is rounding away
-# (4e-16 in the published catalogue). The dual is the end of an integration, whose error grows like
-# the root of kappa: 4e-13 in the catalogue.
-_ENERGY, _ENERGY_OF_DUAL, _GROWTH = 1e-12, 1e-9, 1e-13
-# What a degree loses on its way to radians and back, relative to the angle.
-_DEGREES = 1e-15
-# 2 pi turns - release against the dual of centred orbits [rad]: 4e-15 in the catalogue.
-_HALF_TURNS = 1e-9
-# kappa against its logarithm, and below -1: both are rounding, and zero in the catalogue.
-_KAPPA = 1e-8
-# Where kappa is above the first it is held to the largest that float64 can square, and its
-# logarithm is above the second.
-_CAPPED, _ITS_LOGARITHM = 1e290, 600.0
-# Newton's methods stop at this residual at the latest; it grows like the root of kappa.
-_RESIDUAL = 1e-6
-# The longest period itself lies inside, to this share.
-_LONGEST = 1e-11
-# Along a family either rest moves no faster than the root of the number of nodes, whose mean square
-# is arclength (2.1 in the catalogue), and log of the period not much faster than arclength (0.9
-# there).
-# Arclength itself is rounded.
-_REST, _LOG_PERIOD, _ARCLENGTH = math.sqrt(SEGMENTS), 3.0, 1e-9
-# Periods between two rows may be shorter than both, and the limit of shrinking orbits is
-# extrapolated [relative].
-_SHORTEST = 1e-3
-
-Table: TypeAlias = dict[str, np.ndarray]
-Families: TypeAlias = Mapping[str, dict[str, Any]]
-
-UNITS = {
-    "theta1": "deg",
-    "theta2": "deg",
-    "dual_theta1": "deg",
-    "dual_theta2": "deg",
-    "theta2_error": "deg",
-    "period": "s",
-    "period_error": "s",
-    "energy": "J",
-}
-# Columns and their types; those without a unit here are as in `PeriodicOrbit` and `Family`.
-COLUMNS: dict[str, type] = {
-    "family": str,
-    "arclength": float,
-    "theta1": float,
-    "theta2": float,
-    "period": float,
-    "energy": float,
-    "kappa": float,
-    "log_abs_kappa": float,
-    "symmetry": str,
-    "dual_theta1": float,
-    "dual_theta2": float,
-    "turns1": int,
-    "turns2": int,
-    "residual": float,
-    "theta2_error": float,
-    "period_error": float,
-    "iterations": int,
-    "status": int,
-}
+# Names of the pendulum's fields in a file.
 _PENDULUM = {name: file_name(name, unit) for name, unit in units_of(Pendulum).items()}
-# What else the file says, and the types of it.
+# What a file says besides its orbits, and the types of it.
 _ABOUT = {
     "dpend_version": str,
     "pendulum": dict,
@@ -132,11 +80,14 @@ _ENDS = (
     "lost",
     "unfinished",
 )
+# Kinds of special points.
 _KIND = re.compile(
     r"stability_lost|stability_gained|fold_theta1|fold_energy|crossing|resonance_[1-9]\d*:[1-9]\d*"
 )
+# Numbers as `Atlas.save` writes them in CSV. Python reads more: blanks, 1_000, other scripts.
 _NUMBER = re.compile(r"-?(\d+(\.\d*)?([eE][-+]?\d+)?|inf)|nan", re.ASCII)
 _INTEGER = re.compile(r"-?\d{1,18}", re.ASCII)
+# Types as errors name them.
 _TYPES = {
     str: "text",
     dict: "an object",
@@ -164,24 +115,10 @@ class _Rows(NamedTuple):
     place: Callable[[int], str]
 
 
-def column_name(column: str) -> str:
-    """A column's name in a file."""
-    return f"{column}_{UNITS[column]}" if column in UNITS else column
-
-
-def column_values(column: str, values: np.ndarray) -> list[Any]:
-    """A column as a file has it: angles in degrees, the status by its name."""
-    if column == "status":
-        return [Status(value).name.lower() for value in values.tolist()]
-    converted: list[Any] = (np.degrees(values) if UNITS.get(column) == "deg" else values).tolist()
-    return converted
-
-
 def read_catalogue(path: Path) -> Catalogue:
-    """What F.csv or F.json holds; rows are counted from 1, and lines too.
+    """What F.csv or F.json holds. Errors count rows and lines from 1.
 
-    Files of any `dpend_version` are read: what they must be like is said here, and a number is as
-    true as before.
+    Files of any `dpend_version` are read, because each is checked in full.
 
     Raises:
         OSError: it cannot be read.
@@ -195,7 +132,7 @@ def read_catalogue(path: Path) -> Catalogue:
     if about.get("rows", count) != count:
         raise ValueError(f"rows is {about['rows']}, and there are {count}")
     families = {one["family"]: one for one in about["families"]}
-    _Check(table, rows.place).run(pendulum, max_period, families)
+    TableCheck(table, rows.place).run(pendulum, max_period, families)
     return Catalogue(pendulum, max_period, table, tuple(about["families"]), about["coverage"])
 
 
@@ -204,6 +141,23 @@ def _csv_parts(text: str) -> tuple[Any, _Rows]:
         raise ValueError("line 1 must be a comment, # and a JSON object")
     lines = io.StringIO(text, newline=None)
     about = parse_json(lines.readline()[1:])
+    header, found = _csv_lines(lines)
+
+    def place(i: int) -> str:
+        return f"row {i + 1} in line {found[i][1]}"
+
+    for i, (row, _) in enumerate(found):
+        if len(row) != len(header):
+            raise ValueError(f"{place(i)} has {len(row)} cells, the header has {len(header)}")
+    columns = list(zip(*(row for row, _ in found), strict=True)) or [()] * len(header)
+    by_name = dict(zip(header, columns, strict=True))
+    return about, _Rows(
+        {key: _parse_cells(key, by_name[column_name(key)], place) for key in COLUMNS}, place
+    )
+
+
+def _csv_lines(lines: Iterable[str]) -> tuple[list[str], list[tuple[list[str], int]]]:
+    """The header, and each row with the number of its line in a file with one line before."""
     try:
         reader = csv.reader(lines, strict=True)
         found = [(row, reader.line_num + 1) for row in reader if row]
@@ -213,23 +167,11 @@ def _csv_parts(text: str) -> tuple[Any, _Rows]:
     if header and header[0].startswith("#"):
         raise ValueError("line 2 must be the header, and is another comment")
     _check_names("the header", header, [column_name(key) for key in COLUMNS])
-    for i, (row, line) in enumerate(found[1:]):
-        if len(row) != len(header):
-            raise ValueError(
-                f"row {i + 1} in line {line} has {len(row)} cells, the header has {len(header)}"
-            )
-    columns = list(zip(*(row for row, _ in found[1:]), strict=True)) or [()] * len(header)
-    by_name = dict(zip(header, columns, strict=True))
-
-    def place(i: int) -> str:
-        return f"row {i + 1} in line {found[i + 1][1]}"
-
-    cells = {key: _parse_cells(key, by_name[column_name(key)], place) for key in COLUMNS}
-    return about, _Rows(cells, place)
+    return header, found[1:]
 
 
 def _parse_cells(column: str, cells: Sequence[str], place: Callable[[int], str]) -> Sequence[Any]:
-    """Text as what it says, but for the status; empty cells, blanks and `1_000` are no numbers."""
+    """The numbers of a column of CSV; text and the status stay text."""
     kind = str if column == "status" else COLUMNS[column]
     if kind is str:
         return cells
@@ -266,7 +208,7 @@ def _json_parts(text: str) -> tuple[Any, _Rows]:
 
 
 def _column(column: str, rows: _Rows) -> np.ndarray:
-    """A column in SI units; null is NaN, and what that means is asked for later."""
+    """A column in SI units. null becomes NaN, which `TableCheck` refuses where a number must be."""
     cells, kind = rows.cells[column], COLUMNS[column]
     if column == "status":
         return _statuses(rows)
@@ -353,6 +295,7 @@ def _check_about(about: Any) -> tuple[Pendulum, float]:
 
 
 def check_least(place: str, value: float | int, least: float | int, strict: bool = False) -> None:
+    """Refuses a number below `least`, with `strict` also `least` itself."""
     if value < least or (strict and value == least):
         raise ValueError(
             f"{place} must be {'above' if strict else 'at least'} {least:g}, is {value:.10g}"
@@ -365,7 +308,7 @@ def _check_one_of(place: str, value: Any, known: Sequence[str]) -> None:
 
 
 def _check_family(place: str, family: Any, max_period: float | int) -> None:
-    """Refuses the record of a family that has another form, or special points beyond it."""
+    """Refuses a family's record of another form, and special points outside the family."""
     check_record(place, family, _FAMILY)
     _check_one_of(f"{place}.symmetry", family["symmetry"], RELEASED_SYMMETRIES)
     if not re.fullmatch(
@@ -379,13 +322,10 @@ def _check_family(place: str, family: Any, max_period: float | int) -> None:
         raise ValueError(f"{place}.ends must be a list of two, is {family['ends']!r:.60}")
     for i, end in enumerate(family["ends"]):
         _check_one_of(f"{place}.ends[{i}]", end, _ENDS)
-    shortest, longest, most = (
-        family["shortest_period_s"],
-        family["longest_period_s"],
-        max_period * (1 + _LONGEST),
-    )
+    shortest, longest = family["shortest_period_s"], family["longest_period_s"]
+    most = max_period * (1 + LONGEST)
     check_least(f"{place}.shortest_period_s", shortest, 0, strict=True)
-    check_least(f"{place}.longest_period_s", longest, shortest * (1 - _SHORTEST))
+    check_least(f"{place}.longest_period_s", longest, shortest * (1 - SHORTEST))
     if longest > most:
         raise ValueError(
             f"{place}.longest_period_s is {longest:.10g}, max_period_s is {max_period:.10g}"
@@ -397,179 +337,9 @@ def _check_family(place: str, family: Any, max_period: float | int) -> None:
         if not _KIND.fullmatch(point["kind"]):
             raise ValueError(f"{where}.kind is not known: {point['kind']!r:.60}")
         check_least(f"{where}.arclength", point["arclength"], last)
-        check_least(f"{where}.period_s", point["period_s"], shortest * (1 - _SHORTEST))
+        check_least(f"{where}.period_s", point["period_s"], shortest * (1 - SHORTEST))
         if point["period_s"] > most:
             raise ValueError(
                 f"{where}.period_s is {point['period_s']:.10g}, max_period_s is {max_period:.10g}"
             )
         last = point["arclength"]
-
-
-class _Check(NamedTuple):
-    """A table under examination."""
-
-    table: Table
-    place: Callable[[int], str]
-
-    def refuse(
-        self, wrong: np.ndarray, column: str, says: str, other: np.ndarray | None = None
-    ) -> None:
-        """Refuses the first wrong row, with what its column is and what speaks against it."""
-        if not np.any(wrong):
-            return
-        i = int(np.argmax(wrong))
-        value = self.table[column][i]
-        if COLUMNS[column] is float:
-            shown = f"{np.degrees(value) if UNITS.get(column) == 'deg' else value:.10g}"
-        else:
-            shown = repr(value.item())
-        against = says if other is None else f"{says} {other[i]:.10g}"
-        raise ValueError(f"{self.place(i)}: {column_name(column)} is {shown}, {against}")
-
-    def run(self, pendulum: Pendulum, max_period: float, families: Families) -> None:
-        """Refuses the first row that no orbit has: where a solve failed, numbers may be missing and
-        need not agree.
-        """
-        table = self.table
-        for column, kind in COLUMNS.items():
-            if kind is float and column not in ("arclength", "log_abs_kappa"):
-                self.refuse(~np.isfinite(table[column]) & self.sound, column, "and must be finite")
-        zero = self.sound & (table["kappa"] == 0)
-        table["log_abs_kappa"][zero] = -math.inf  # which JSON cannot say
-        with np.errstate(all="ignore"):
-            self.check_words(families)
-            self.check_sizes(max_period)
-            self.check_energies(pendulum)
-            self.check_stability()
-            self.check_centred()
-            if families:
-                self.check_families(families)
-            else:
-                self.check_releases()
-
-    @property
-    def sound(self) -> np.ndarray:
-        """The rows that converged."""
-        return np.asarray(self.table["status"] == Status.CONVERGED)
-
-    def check_words(self, families: Families) -> None:
-        """Symmetries and families are known ones, and belong together."""
-        table = self.table
-        self.refuse(
-            ~np.isin(table["symmetry"], RELEASED_SYMMETRIES),
-            "symmetry",
-            "and must be centred or brake",
-        )
-        known = (
-            f"the families are {', '.join(families)}" if families else "and there are no families"
-        )
-        self.refuse(~np.isin(table["family"], list(families) or [""]), "family", known)
-        for name, family in families.items():
-            wrong = (table["family"] == name) & (table["symmetry"] != family["symmetry"])
-            self.refuse(wrong, "symmetry", f"its family {name} is {family['symmetry']}")
-
-    def check_sizes(self, max_period: float) -> None:
-        """Each number by itself."""
-        table, sound = self.table, self.sound
-        self.refuse(sound & ~(table["period"] > 0), "period", "and must be positive")
-        most = max_period * (1 + _LONGEST)
-        self.refuse(
-            sound & ~(table["period"] <= most), "period", f"max_period_s is {max_period:.10g}"
-        )
-        for column in ("residual", "theta2_error", "period_error", "iterations"):
-            self.refuse(table[column] < 0, column, "and must not be negative")
-        most_left = _RESIDUAL + _GROWTH * np.sqrt(np.abs(table["kappa"]))
-        wrong = sound & ~(table["residual"] <= most_left)
-        self.refuse(wrong, "residual", "of a converged orbit it is at most", most_left)
-
-    def check_energies(self, pendulum: Pendulum) -> None:
-        """Both rests have the orbit's energy."""
-        table = self.table
-        upper = float((pendulum.m1 + pendulum.m2) * pendulum.g * pendulum.l1)
-        lower = float(pendulum.m2 * pendulum.g * pendulum.l2)
-        of_dual = _ENERGY_OF_DUAL + _GROWTH * np.sqrt(np.abs(table["kappa"]))
-        for rest, whose, share in (("", "release", _ENERGY), ("dual_", "dual", of_dual)):
-            theta1, theta2 = table[f"{rest}theta1"], table[f"{rest}theta2"]
-            energy = -upper * np.cos(theta1) - lower * np.cos(theta2)
-            most = (upper + lower) * (share + _DEGREES * (np.abs(theta1) + np.abs(theta2)))
-            wrong = self.sound & ~(np.abs(energy - table["energy"]) <= most)
-            self.refuse(wrong, "energy", f"its {whose} has", energy)
-
-    def check_stability(self) -> None:
-        """kappa and its logarithm, which is that of kappa - 1 where much has cancelled."""
-        kappa, logarithm = self.table["kappa"], self.table["log_abs_kappa"]
-        size = np.abs(kappa)
-        near = np.minimum(
-            np.abs(np.exp(logarithm) - size), np.abs(np.exp(logarithm) - np.abs(kappa - 1))
-        )
-        agree = (near <= _KAPPA * (1 + size)) | (
-            (size > 1) & (np.abs(logarithm - np.log(size)) <= _KAPPA)
-        )
-        agree |= (size > _CAPPED) & (logarithm > _ITS_LOGARITHM)
-        self.refuse(self.sound & ~agree, "log_abs_kappa", "kappa is", kappa)
-
-    def check_centred(self) -> None:
-        """A centred orbit is its own image, and never doubles its period; others have no turns."""
-        table = self.table
-        centred = self.sound & (table["symmetry"] == "centred")
-        self.refuse(
-            centred & ~(table["kappa"] >= -1 - _KAPPA), "kappa", "below -1 on a centred orbit"
-        )
-        for rod in "12":
-            release, dual, turns = (
-                table[f"{name}{rod}"] for name in ("theta", "dual_theta", "turns")
-            )
-            image = 2 * np.pi * turns - release
-            wrong = centred & ~(
-                np.abs(dual - image) <= _HALF_TURNS + _DEGREES * (np.abs(dual) + np.abs(release))
-            )
-            self.refuse(
-                wrong, f"dual_theta{rod}", f"turns{rod} and its release say", np.degrees(image)
-            )
-            self.refuse(
-                (table["symmetry"] == "brake") & (turns != 0),
-                f"turns{rod}",
-                "of an orbit that is not centred",
-            )
-
-    def check_releases(self) -> None:
-        """Those of one angle are each there once, and have no arclength."""
-        self.refuse(~np.isnan(self.table["arclength"]), "arclength", "and there are no families")
-        whole = np.column_stack([self.table[key] for key in ("theta1", "theta2", "period")])
-        _, first, which = np.unique(whole, axis=0, return_index=True, return_inverse=True)
-        again = self.sound & (first[which.ravel()] != np.arange(len(whole)))
-        self.refuse(again, "theta2", "and another row has the same orbit")
-
-    def check_families(self, families: Families) -> None:
-        """Each has its own range of periods, and neighbours."""
-        table = self.table
-        self.refuse(~(table["arclength"] >= 0), "arclength", "and must be a number of at least 0")
-        for name, family in families.items():
-            own = table["family"] == name
-            shortest, longest = family["shortest_period_s"], family["longest_period_s"]
-            low = own & self.sound & (table["period"] < shortest * (1 - _SHORTEST))
-            self.refuse(low, "period", f"the shortest of its family is {shortest:.10g}")
-            high = own & self.sound & (table["period"] > longest * (1 + _LONGEST))
-            self.refuse(high, "period", f"the longest of its family is {longest:.10g}")
-            self.refuse_neighbours(np.flatnonzero(own), "arclength", lambda way, step: way <= 0)
-            rows = np.flatnonzero(own & self.sound)
-            self.refuse_neighbours(
-                rows, "log_period", lambda way, step: np.abs(way) > _LOG_PERIOD * step
-            )
-            for column in ("theta1", "theta2", "dual_theta1", "dual_theta2"):
-                self.refuse_neighbours(rows, column, lambda way, step: np.abs(way) > _REST * step)
-
-    def refuse_neighbours(
-        self, rows: np.ndarray, column: str, leaps: Callable[..., np.ndarray]
-    ) -> None:
-        """Refuses a row too far from the one before, on its family."""
-        values = np.log(self.table["period"]) if column == "log_period" else self.table[column]
-        step = np.diff(self.table["arclength"][rows]) + _ARCLENGTH
-        wrong = np.zeros(len(values), bool)
-        wrong[rows[1:]] = leaps(np.diff(values[rows]), step)
-        before = np.append(np.nan, values[:-1])
-        before[rows[1:]] = values[rows[:-1]]
-        shown = np.exp(before) if column == "log_period" else before
-        shown = np.degrees(shown) if UNITS.get(column) == "deg" else shown
-        column = "period" if column == "log_period" else column
-        self.refuse(wrong, column, "which does not follow on", shown)

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from dpend.catalogue.atlas import BEYOND
 from dpend.catalogue.files import check_least, check_record, check_type
+from dpend.catalogue.release import BEYOND
 from dpend.catalogue.track import Track
-from dpend.records import json_text, parse_json, read_text, replacing
+from dpend.places import read_text, replacing
+from dpend.records import json_text, parse_json
 
 # Slices are odd multiples of pi/2^(level + 1), on so many levels at most.
 MOST_LEVELS = 10

@@ -18,19 +18,7 @@ from typing import Any
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.catalogue.atlas import (
-    COUNTABLE,
-    MOST_SEARCH_STEPS,
-    STEPS_PER_ORBIT,
-    Atlas,
-    Coverage,
-    foresee_returns,
-    is_return,
-    known_budget,
-    known_period,
-    returns,
-    stacked,
-)
+from dpend.catalogue.atlas import Atlas, Coverage
 from dpend.catalogue.entries import entry_of, in_order
 from dpend.catalogue.progress import (
     MOST_LEVELS,
@@ -40,13 +28,25 @@ from dpend.catalogue.progress import (
     slice_angles,
     write_store,
 )
+from dpend.catalogue.release import (
+    COUNTABLE,
+    MOST_SEARCH_STEPS,
+    STEPS_PER_ORBIT,
+    foresee_returns,
+    is_return,
+    known_budget,
+    known_period,
+    returns,
+)
 from dpend.catalogue.scan import MOTIONS_PER_WAVE, Budget, Zero
+from dpend.catalogue.table import stacked
 from dpend.catalogue.track import NEAR, STEP, STEPS_PER_POINT, Track, partnerless, without_pairs
-from dpend.checks import check_place, file_path, function, known_number
+from dpend.checks import function, known_number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.family import follow_family
 from dpend.orbits.find import find_orbit, swinging_pendulum
 from dpend.orbits.orbit import PeriodicOrbit
+from dpend.places import check_place, file_path
 from dpend.status import Status
 
 # Doublings of the slices before the search may end.

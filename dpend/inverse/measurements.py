@@ -21,8 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dpend.checks import file_path, numbers
-from dpend.records import parse_decimal, read_text
+from dpend.checks import numbers
+from dpend.places import file_path, read_text
+from dpend.records import parse_decimal
 
 
 class Angles(NamedTuple):

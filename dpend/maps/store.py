@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from dpend.checks import unwritable
 from dpend.maps.disk import MISSING, canonical, clear, make_way, put, read, read_json, remove, sync
+from dpend.places import unwritable
 
 # Where the digests of tiles and the lock lie: inside an array, where Zarr's readers do not look.
 _DIGESTS, _LOCK = "status/sha256", "status/lock"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.checks import file_path, flag, function, known_number, shown, text
+from dpend.checks import flag, function, known_number, shown, text
 from dpend.maps.cost import COUNTABLE, MOST_SWEEP_STEPS, Cost
 from dpend.maps.grid import PENDULUM, Grid, Keyed, Quantity, Task, coordinates_of, units_of
 from dpend.maps.layout import store_of
@@ -21,6 +21,7 @@ from dpend.maps.store import Store, StoreWarning, check_store
 from dpend.maps.tiles import Work, find_parities, whole_tile
 from dpend.mechanics.pendulum import Pendulum
 from dpend.methods.scheme import Scheme, scheme_for
+from dpend.places import file_path
 from dpend.status import Status
 
 # The default tolerance [rad]: a map's colours need no more.

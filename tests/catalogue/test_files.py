@@ -15,7 +15,8 @@ import pytest
 
 import dpend
 from dpend import Status
-from dpend.records import LARGEST_FILE, parse_json, read_text
+from dpend.places import LARGEST_FILE, read_text
+from dpend.records import parse_json
 
 PUBLISHED = Path(__file__).parents[2] / "experiments" / "atlas"
 
