@@ -51,8 +51,8 @@ from dpend.motion.integrate import fold as fold
 from dpend.motion.reference import reference as reference
 from dpend.motion.simulate import Trajectory as Trajectory
 from dpend.motion.simulate import simulate as simulate
+from dpend.orbits.continuation import follow_family as follow_family
 from dpend.orbits.family import Family as Family
-from dpend.orbits.family import follow_family as follow_family
 from dpend.orbits.find import find_orbit as find_orbit
 from dpend.orbits.orbit import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits.samples import SpecialPoint as SpecialPoint

@@ -562,7 +562,7 @@ DOORS = {
             ),
             "most_points": kind([*COUNT[0], 1], [2, np.int64(100)]),
         },
-        "dpend.orbits.family._from_mode",
+        "dpend.orbits.continuation._from_mode",
     ),
     "Family.at": Door(
         FAMILY.at,

@@ -43,7 +43,7 @@ from dpend.catalogue.table import stacked
 from dpend.catalogue.track import NEAR, STEP, STEPS_PER_POINT, Track, partnerless, without_pairs
 from dpend.checks import function, known_number
 from dpend.mechanics.pendulum import Pendulum
-from dpend.orbits.family import follow_family
+from dpend.orbits.continuation import follow_family
 from dpend.orbits.find import find_orbit, swinging_pendulum
 from dpend.orbits.orbit import PeriodicOrbit
 from dpend.places import check_place, file_path

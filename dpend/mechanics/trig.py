@@ -95,7 +95,9 @@ def _sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Ar
 
 
 @_sincos.defjvp
-def _sincos_jvp(primals, tangents):  # type: ignore[no-untyped-def]
+def _sincos_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     (x,), (dx,) = primals, tangents
     sine, cosine = _sincos(x)
     return (sine, cosine), (cosine * dx, -sine * dx)

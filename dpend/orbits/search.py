@@ -12,12 +12,9 @@ from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.arc import MOST_SEGMENT_STEPS, TURN, UNKNOWNS, Arc, arc_of
 from dpend.orbits.newton import METRIC, THETA1, THETA2, TOLERANCE, Aim, Solved, correct
-from dpend.orbits.walk import STRAYED, Walk, hermite, start_at_mode, take_step
+from dpend.orbits.walk import LONGEST_STEP, STRAYED, Walk, hermite, start_at_mode, take_step
 from dpend.status import Status
 
-# The longest step in arclength: its cubic is true to a thousandth, from where Newton's method goes
-# on.
-_LONGEST_STEP = 0.25
 # Each step is looked at in this many pieces for crossings: no step turns enough to cross twice
 # within one of them.
 _PIECES = 16
@@ -99,7 +96,7 @@ def search(pendulum: Pendulum, slow: Scalar, wish: Wish, last: Aim) -> Search:
         final = s.status == _LOCATED
         aim = jax.tree.map(partial(jnp.where, final), _aim_at(s, wish, last), s.aim)
         walk, new, taken, end = take_step(
-            pendulum, s.walk, jnp.asarray(_LONGEST_STEP), arc, (final, aim)
+            pendulum, s.walk, jnp.asarray(LONGEST_STEP), arc, (final, aim)
         )
         steps = jnp.where(final, aim.steps, s.walk.steps)
         work = s.work + new.iterations * steps

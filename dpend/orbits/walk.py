@@ -31,6 +31,10 @@ def hermite(start: Any, slope: Any, end: Any, end_slope: Any, length: Any, s: An
     )
 
 
+# The longest step in arclength: a hundred points or so for a family, close enough for cubics to
+# show every turn. Every walk takes it, so that a search for a release and a family that pass close
+# by another curve go on along the same one.
+LONGEST_STEP = 0.1
 # The first step from a normal mode, where the linear motion is true to 1e-4.
 FIRST_STEP = 0.02
 # A step is taken back if the curve turned by more (cosine), or missed its prediction by more (of
