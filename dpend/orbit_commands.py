@@ -17,8 +17,8 @@ from dpend.catalogue import survey
 from dpend.catalogue.release import (
     MOST_SEARCH_STEPS,
     SECONDS_PER_STEP,
-    expected_steps,
-    known_period,
+    check_period,
+    foresee_steps,
 )
 from dpend.checks import number
 from dpend.mechanics.pendulum import Pendulum
@@ -210,10 +210,10 @@ def _check_places(theta1: float | None, out: Path | None, store: Path | None) ->
 
 
 def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None) -> int | float:
-    known_period(pendulum, max_period)
+    check_period(pendulum, max_period)
     if theta1 is None:
-        return survey.expected_steps(pendulum, max_period)
-    return expected_steps(pendulum, max_period, radians("theta1", theta1))
+        return survey.foresee_steps(pendulum, max_period)
+    return foresee_steps(pendulum, max_period, radians("theta1", theta1))
 
 
 @command()

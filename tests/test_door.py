@@ -30,7 +30,7 @@ import dpend.animate
 import dpend.chaos
 import dpend.plots
 from dpend import Pendulum, Scheme, State
-from dpend.catalogue.table import stacked
+from dpend.catalogue.table import stack_tables
 
 HUGE = 10**400
 PAPER, RELEASE, FINE = Pendulum(), dpend.released(0.5, 0.7), Scheme("rk8", 1e-2)
@@ -277,7 +277,7 @@ ORBIT = dpend.PeriodicOrbit(
 FAMILY = object.__new__(dpend.Family)  # nobody follows one for this
 for field in ("_problem", "_curve"):
     object.__setattr__(FAMILY, field, None)
-EMPTY = dpend.Atlas(PAPER, 1.0, stacked([]), (), dpend.Coverage(0, 0, 0, 0, 0, 0))
+EMPTY = dpend.Atlas(PAPER, 1.0, stack_tables([]), (), dpend.Coverage(0, 0, 0, 0, 0, 0))
 PAIR = kind(
     [*NO_OBJECTS, (1, 2, 3), (2, 1), (math.nan, 1.0), ("1", "2"), (None, 1.0), (True, 2.0), "12"],
     [(1, 2), [0.5, math.inf], np.array([1.0, 2.0]), (-math.inf, HUGE // HUGE)],
@@ -586,7 +586,7 @@ DOORS = {
             "most_steps": POSITIVE,
             "progress": PROGRESS,
         },
-        "dpend.catalogue.release.expected_steps",
+        "dpend.catalogue.release.foresee_steps",
     ),
     "find_brake_families": Door(
         dpend.find_brake_families,
@@ -598,7 +598,7 @@ DOORS = {
             "most_steps": POSITIVE,
             "progress": PROGRESS,
         },
-        "dpend.catalogue.survey.expected_steps",
+        "dpend.catalogue.survey.foresee_steps",
     ),
     "load_atlas": Door(
         dpend.load_atlas, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}

@@ -22,9 +22,9 @@ from dpend.catalogue.scan import (
     Zero,
     foresee,
     longest,
-    scanned,
+    scan_release,
 )
-from dpend.catalogue.table import stacked, table_of
+from dpend.catalogue.table import stack_tables, table_of
 from dpend.checks import function, known_number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.mechanics.trig import LARGEST_ANGLE
@@ -107,9 +107,9 @@ def find_brake_orbits(
     theta1, most_steps = _check_angle(theta1), known_number("most_steps", most_steps, positive=True)
     if progress is not None:
         function("progress", progress, "(steps taken, steps expected)", "print")
-    max_period = known_period(fixed, max_period)
-    expected = expected_steps(fixed, max_period, theta1)
-    budget = known_budget(most_steps, expected, max_period)
+    max_period = check_period(fixed, max_period)
+    expected = foresee_steps(fixed, max_period, theta1)
+    budget = make_budget(most_steps, expected, max_period)
     if progress is not None:
         progress(0, expected)
         budget.tell = lambda spent: progress(spent, max(spent, expected))
@@ -133,7 +133,7 @@ def find_brake_orbits(
         degree=result.degree,
         exhausted=budget.exhausted,
     )
-    return Atlas(fixed, max_period, stacked([_row(orbit) for orbit in found]), (), coverage)
+    return Atlas(fixed, max_period, stack_tables([_row(orbit) for orbit in found]), (), coverage)
 
 
 def _check_angle(theta1: Any) -> float:
@@ -146,7 +146,7 @@ def _check_angle(theta1: Any) -> float:
     return value
 
 
-def known_period(pendulum: Pendulum, max_period: Any) -> float:
+def check_period(pendulum: Pendulum, max_period: Any) -> float:
     """`max_period`, refused where no scan reaches, and pendulums that float64 cannot hold."""
     value = known_number("max_period", max_period, positive=True, unit="s")
     _check_scales(pendulum)
@@ -192,7 +192,7 @@ def _check_scales(pendulum: Pendulum) -> None:
             )
 
 
-def expected_steps(pendulum: Pendulum, max_period: float, theta1: float) -> int:
+def foresee_steps(pendulum: Pendulum, max_period: float, theta1: float) -> int:
     """The time steps that `find_brake_orbits` will take, roughly: three scans, and the returns
     solved.
     """
@@ -209,7 +209,7 @@ def foresee_returns(pendulum: Pendulum, theta1: float, max_period: float) -> Out
     return foresee(scaled, math.remainder(theta1, 2 * math.pi), half)
 
 
-def known_budget(most_steps: float, expected: int, max_period: float) -> Budget:
+def make_budget(most_steps: float, expected: int, max_period: float) -> Budget:
     """`most_steps`, refused if the search is expected to take more."""
     if most_steps < expected:
         raise ValueError(
@@ -231,7 +231,7 @@ def returns(
 ) -> Scan:
     """All returns to rest within half of `max_period`, times in seconds."""
     scaled, half, second = _in_natural_units(pendulum, max_period)
-    result = scanned(scaled, math.remainder(theta1, 2 * math.pi), half, intervals, budget)
+    result = scan_release(scaled, math.remainder(theta1, 2 * math.pi), half, intervals, budget)
     zeros = tuple(
         zero._replace(time=zero.time * second, row=zero.row * second) for zero in result.zeros
     )

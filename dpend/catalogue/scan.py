@@ -147,7 +147,7 @@ class Scan:
         return round(sum(zero.sign for zero in self.zeros))
 
 
-def scanned(
+def scan_release(
     pendulum: Pendulum, theta1: float, duration: float, intervals: int, budget: Budget
 ) -> Scan:
     """All returns to rest up to `duration`, from so many intervals of theta2 to begin with.
@@ -167,7 +167,7 @@ def scanned(
 
 
 def foresee(pendulum: Pendulum, theta1: float, duration: float) -> Outlook:
-    """What `scanned` will take: from the slopes of a few motions, without looking for returns.
+    """What `scan_release` will take: from the slopes of a few motions, without looking for returns.
 
     The slope's mean over theta2, against the usual size of p, is the number of waves. It grows like
     the distance of neighbouring motions, and intervals must be as narrow as the waves.

@@ -32,14 +32,14 @@ from dpend.catalogue.release import (
     COUNTABLE,
     MOST_SEARCH_STEPS,
     STEPS_PER_ORBIT,
+    check_period,
     foresee_returns,
     is_return,
-    known_budget,
-    known_period,
+    make_budget,
     returns,
 )
 from dpend.catalogue.scan import MOTIONS_PER_WAVE, Budget, Zero
-from dpend.catalogue.table import stacked
+from dpend.catalogue.table import stack_tables
 from dpend.catalogue.track import NEAR, STEP, STEPS_PER_POINT, Track, partnerless, without_pairs
 from dpend.checks import function, known_number
 from dpend.mechanics.pendulum import Pendulum
@@ -110,7 +110,7 @@ def find_brake_families(
     require_float64()
     fixed = swinging_pendulum(pendulum)
     most_steps = known_number("most_steps", most_steps, positive=True)
-    max_period = known_period(fixed, max_period)
+    max_period = check_period(fixed, max_period)
     path = None if store is None else file_path("store", store)
     if progress is not None:
         function("progress", progress, "(slices done, slices planned, families)", "print")
@@ -120,7 +120,7 @@ def find_brake_families(
     record = None
     if path is not None and path.exists():
         record = read_store(path, survey.settings)
-    survey.budget = known_budget(most_steps, expected_steps(fixed, max_period), max_period)
+    survey.budget = make_budget(most_steps, foresee_steps(fixed, max_period), max_period)
     if path is not None and record is not None:
         _resume(survey, record, path)
     for level in range(MOST_LEVELS):
@@ -163,7 +163,7 @@ def _resume(survey: "_Survey", record: dict[str, Any], path: Path) -> None:
     survey.slices |= {one.pop("theta1"): Slice(**one) for one in record["slices"]}
 
 
-def expected_steps(pendulum: Pendulum, max_period: float) -> int:
+def foresee_steps(pendulum: Pendulum, max_period: float) -> int:
     """The time steps that `find_brake_families` will take, roughly, from what three slices have
     before them.
     """
@@ -317,4 +317,4 @@ class _Survey:
             slices=len(self.slices),
             exhausted=self.budget.exhausted,
         )
-        return Atlas(self.pendulum, self.max_period, stacked(tables), tuple(records), coverage)
+        return Atlas(self.pendulum, self.max_period, stack_tables(tables), tuple(records), coverage)

@@ -133,7 +133,7 @@ def orbit_of(pendulum: Pendulum, table: Table, i: int) -> PeriodicOrbit:
     )
 
 
-def stacked(tables: Sequence[Table]) -> Table:
+def stack_tables(tables: Sequence[Table]) -> Table:
     """One table below the other."""
     return {
         key: np.concatenate([table[key] for table in tables]) if tables else np.zeros(0, kind)

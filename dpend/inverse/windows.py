@@ -39,7 +39,7 @@ from dpend.mechanics.pendulum import (
     velocities,
 )
 from dpend.methods.scheme import Scheme
-from dpend.motion.integrate import moved, step_size
+from dpend.motion.integrate import advance_state, step_size
 
 # Order 8 in (theta, p) with its stages as a loop, which compiles in seconds together with its
 # derivatives. Only its method is used.
@@ -86,7 +86,7 @@ def _window(
     pendulum = Pendulum(one, jnp.exp(logs[0]), one, jnp.exp(logs[1]), gravity * jnp.exp(logs[2]))
 
     def interval(state: State, dt: Array) -> tuple[State, Array]:
-        state = moved(_METHOD, pendulum, state, step_size(dt, steps), steps)
+        state = advance_state(_METHOD, pendulum, state, step_size(dt, steps), steps)
         return state, jnp.stack([state.theta1, state.theta2])
 
     end, angles = lax.scan(interval, momenta(pendulum, *nodes), dts)

@@ -59,7 +59,9 @@ def march(
     return run(carry, first + blocks * block, rest) if rest else carry
 
 
-def moved(scheme: Scheme, pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar) -> State:
+def advance_state(
+    scheme: Scheme, pendulum: Pendulum, state: State, dt: Scalar, steps: Scalar
+) -> State:
     """The state after `steps` even steps of `dt` [s]: `flow` for counts that may be traced."""
     constants = scheme.constants(pendulum, dt)
     end = march(

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, State, fast_frequency, fastest, vector_field
 from dpend.methods.scheme import Scheme
-from dpend.motion.integrate import moved, step_size
+from dpend.motion.integrate import advance_state, step_size
 from dpend.orbits.stability import transition
 
 # Two AVX-512 registers of lanes; the linear algebra grows with the third power of this number.
@@ -216,7 +216,7 @@ def lay_arc(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -
         rest = time - times[nearest]
         steps = jnp.clip(jnp.ceil(rest * rate / TURN), 1, 100 * MOST_SEGMENT_STEPS).astype(int)
         return stack_state(
-            moved(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps)
+            advance_state(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps)
         )
 
     def nodes(delta: Scalar) -> tuple[Scalar, Array]:

@@ -27,7 +27,7 @@ from dpend.orbits.curve import (
 )
 from dpend.orbits.family import Family, family_of
 from dpend.orbits.find import swinging_pendulum
-from dpend.orbits.follow import FamilyProblem, Reach, guess_arc, repeated, start_at
+from dpend.orbits.follow import FamilyProblem, Reach, guess_arc, repeat_arc, start_at
 from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
 from dpend.orbits.samples import SpecialPoint
@@ -129,7 +129,7 @@ _beginning = jax.jit(start_at_mode)
 
 def _from_mode(problem: FamilyProblem, branch: str, reach: Reach) -> Family:
     start = jax.tree.map(np.asarray, _beginning(problem.natural, branch == "in-phase"))
-    rows, end = problem.followed(start, None, reach)
+    rows, end = problem.follow_curve(start, None, reach)
     if not len(rows.point):
         raise _too_short(reach)
     curve = curve_of(rows)
@@ -203,10 +203,10 @@ def _both_ways(problem: FamilyProblem, rows: Solved, reach: Reach) -> Family:
     """The family through a point, in both directions unless it is closed."""
     first = min(FIRST_STEP, reach.step)
     start = start_at(rows.point[0], rows.tangent[0], first, rows.steps[0])
-    ahead, end = problem.followed(start, rows, reach)
+    ahead, end = problem.follow_curve(start, rows, reach)
     if end == "closed":
         return _closed(problem, rows, ahead)
-    behind, begin = problem.followed(start._replace(tangent=-start.tangent), rows, reach)
+    behind, begin = problem.follow_curve(start._replace(tangent=-start.tangent), rows, reach)
     whole, ends, here = concatenate(reversed_(behind), rows, ahead), (begin, end), len(behind.point)
     if problem.symmetry == "brake":
         whole, ends = drop_mirror_half(whole, ends, here)
@@ -235,7 +235,7 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) 
     duration = k * half * 2 / PARTS[symmetry]
     turns = base.problem.turns if symmetry != "brake" else (0.0, 0.0)
     problem = FamilyProblem(pendulum, base.problem.natural, symmetry, turns)
-    point = guess_arc(problem, *repeated(base.problem, base.rows, k), duration)
+    point = guess_arc(problem, *repeat_arc(base.problem, base.rows, k), duration)
     sides = []
     for sign in (1.0, -1.0):
         rows = problem.onto_branch(base.rows, point, sign)
@@ -244,7 +244,7 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) 
         if problem.period(rows)[0] > reach.period:
             raise _too_short(reach)
         start = start_at(rows.point[0], rows.tangent[0], min(FIRST_STEP, reach.step), rows.steps[0])
-        ahead, end = problem.followed(start, rows, reach)
+        ahead, end = problem.follow_curve(start, rows, reach)
         if end == "closed":
             return _closed(problem, rows, ahead)
         sides.append((concatenate(rows, ahead), end))

@@ -92,10 +92,14 @@ def outside(zones: Sequence[Zone], samples: Samples, *, with_ends: bool = False)
         inside = (samples.where >= zone.ends[0]) & (samples.where <= zone.ends[1])
         apart &= ~inside if with_ends else ~inside | np.isin(samples.where, zone.ends)
     kept = Samples(samples.where[apart], select(samples.rows, apart))
-    return merged(kept, *(Samples(zone.ends, zone.rows) for zone in zones)) if with_ends else kept
+    return (
+        merge_samples(kept, *(Samples(zone.ends, zone.rows) for zone in zones))
+        if with_ends
+        else kept
+    )
 
 
-def merged(*parts: Samples) -> Samples:
+def merge_samples(*parts: Samples) -> Samples:
     where = np.concatenate([part.where for part in parts])
     order = np.argsort(where, kind="stable")
     return Samples(where[order], select(concatenate(*(part.rows for part in parts)), order))

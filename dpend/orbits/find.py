@@ -272,7 +272,7 @@ def find_orbit(
     if guess is None:
         slow = (branch or ("in-phase" if ratio == 1 else "anti-phase")) == "in-phase"
         return _on_branch(pendulum, theta1, slow, (crossing, float(ratio or 0)), settings, error)
-    theta2, period = (jnp.asarray(value, jnp.float64) for value in _guessed(guess))
+    theta2, period = (jnp.asarray(value, jnp.float64) for value in _guess_of(guess))
     if ratio is None:
         directions, x = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), theta2
     else:
@@ -345,7 +345,7 @@ def _check_release(pendulum: Pendulum, theta1: Scalar) -> None:
 
 def _check_guess(guess: Any, angle1: float | None) -> None:
     """Refuses a guess that is an equilibrium or has no period."""
-    theta2, period = (known_value(value) for value in _guessed(guess))
+    theta2, period = (known_value(value) for value in _guess_of(guess))
     if period is not None and not period > 0:
         raise ValueError(f"period must be positive [s], got {period:g}: give another guess")
     if angle1 is None or theta2 is None:
@@ -358,7 +358,7 @@ def _check_guess(guess: Any, angle1: float | None) -> None:
         )
 
 
-def _guessed(guess: Any) -> tuple[Scalar, Scalar]:
+def _guess_of(guess: Any) -> tuple[Scalar, Scalar]:
     """theta2 [rad] and the period [s] of a guess, checked."""
     theta2, period = several("guess", guess, "a pair (theta2, period)", 2)
     for name, value in (("theta2", theta2), ("period", period)):

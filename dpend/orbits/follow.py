@@ -73,9 +73,9 @@ class FamilyProblem:
             some = slice(first, first + CHUNK)
             count = len(points[some])
             tasks = Tasks(
-                _padded(points[some]),
-                _padded(rows[some]),
-                _padded(steps[some]).astype(int),
+                _pad(points[some]),
+                _pad(rows[some]),
+                _pad(steps[some]).astype(int),
                 np.int64(count),
             )
             _, table, _, _ = walk(
@@ -84,7 +84,7 @@ class FamilyProblem:
             tables.append(np.asarray(table)[:count])
         return unpack_table(np.concatenate(tables))
 
-    def followed(self, start: Walk, origin: Solved | None, reach: Reach) -> tuple[Solved, str]:
+    def follow_curve(self, start: Walk, origin: Solved | None, reach: Reach) -> tuple[Solved, str]:
         """The points after `start`, and what the family's end is; `origin` is the place it could
         come back to.
         """
@@ -255,7 +255,7 @@ def start_at(point: np.ndarray, tangent: np.ndarray, step: Scalar, steps: Scalar
     return Walk(point, tangent, point, tangent, length, size, side, count, tangent, leap)
 
 
-def _padded(array: np.ndarray) -> np.ndarray:
+def _pad(array: np.ndarray) -> np.ndarray:
     missing = CHUNK - len(array)
     return np.concatenate([array, np.repeat(array[:1], missing, axis=0)])
 
@@ -277,7 +277,7 @@ def guess_arc(
 _KNOWN = 4 * SEGMENTS * LARGEST_COVER
 
 
-def _unrolled(problem: FamilyProblem, rows: Solved) -> tuple[np.ndarray, np.ndarray]:
+def _unroll(problem: FamilyProblem, rows: Solved) -> tuple[np.ndarray, np.ndarray]:
     """Times and states known on half a period of an orbit: its nodes and, if it is centred, their
     images about T/4.
     """
@@ -290,9 +290,9 @@ def _unrolled(problem: FamilyProblem, rows: Solved) -> tuple[np.ndarray, np.ndar
     return np.append(times, 2 * times[-1] - times[-2:0:-1]), np.vstack([states, centre, images])
 
 
-def repeated(problem: FamilyProblem, rows: Solved, halves: int) -> tuple[np.ndarray, np.ndarray]:
+def repeat_arc(problem: FamilyProblem, rows: Solved, halves: int) -> tuple[np.ndarray, np.ndarray]:
     """Times and states known on so many halves of an orbit's period."""
-    times, states = _unrolled(problem, rows)
+    times, states = _unroll(problem, rows)
     half = rows.times[0].sum() * PARTS[problem.symmetry] / 2
     all_times, all_states = [times], [states]
     for i in range(1, halves):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, State, hamiltonian, released
-from dpend.motion.integrate import moved, step_size
+from dpend.motion.integrate import advance_state, step_size
 from dpend.orbits.arc import (
     LOG_DELTA,
     METHOD,
@@ -125,7 +125,9 @@ def _linearise_arc(
     def closings(parameters: Array) -> Array:
         here, nodes = _pendulum(parameters), point[:LOG_DELTA].reshape(SEGMENTS, 4)
         time, _ = arc_times(here, point)
-        end = stack_state(moved(METHOD, here, State(*nodes.T), step_size(time, steps), steps)).T
+        end = stack_state(
+            advance_state(METHOD, here, State(*nodes.T), step_size(time, steps), steps)
+        ).T
         conditions, _ = end_conditions(here, nodes[0], end[-1], point[UNFOLDING], arc)
         border = given.row @ point - parameters[2]
         return jnp.concatenate([(end[:-1] - nodes[1:]).ravel(), conditions, border[None]])
@@ -177,7 +179,9 @@ def _linearise_piece(
 
     def ends(both: Array) -> Array:
         start = released(*(both[4] * given.origin + both[0] * given.direction))
-        end = moved(RK8, _pendulum(both[2:]), start, step_size(jnp.exp(both[1]), steps), steps)
+        end = advance_state(
+            RK8, _pendulum(both[2:]), start, step_size(jnp.exp(both[1]), steps), steps
+        )
         # Momenta without their unit: at a root the factor does not matter.
         return jnp.stack([end.theta1, end.theta2] if symmetry == "centred" else [end.p1, end.p2])
 

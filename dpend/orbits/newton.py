@@ -247,7 +247,7 @@ def correct(pendulum: Pendulum, aim: Aim, arc: Arc) -> Solved:
     def running(n: _Newton) -> Scalar:
         return n.done < 2
 
-    return _solved(
+    return _describe_root(
         pendulum,
         lax.while_loop(running, lambda n: _iterate(pendulum, aim, arc, n), start),
         aim,
@@ -255,7 +255,7 @@ def correct(pendulum: Pendulum, aim: Aim, arc: Arc) -> Solved:
     )
 
 
-def _solved(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved:
+def _describe_root(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved:
     """What is told of the point where Newton's method ended."""
     tangent = n.null / jnp.sqrt(n.null @ (METRIC * n.null))
     s = n.equations.segments

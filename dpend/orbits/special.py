@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from dpend.orbits.crossings import Zone, crossings, merged, outside, overlaps
+from dpend.orbits.crossings import Zone, crossings, merge_samples, outside, overlaps
 from dpend.orbits.curve import Curve, select
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.newton import Solved
@@ -45,7 +45,7 @@ def special_points(
         for z in zones
     ]
     if changes:
-        places += _told(changes, _located(track, changes, zones), places, samples.where, problem)
+        places += _describe(changes, _locate(track, changes, zones), places, samples.where, problem)
     return [_special(problem, spot) for spot in sorted(places, key=lambda spot: spot.where)]
 
 
@@ -90,7 +90,7 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
         more.append(Samples(spots, rows))
         for j, (function, place, height, sense) in enumerate(triples):
             _narrow(place, height, spots[j], sense * function(select(rows, slice(j, j + 1)))[0])
-    return merged(samples, *more)
+    return merge_samples(samples, *more)
 
 
 def _in_reach(h: np.ndarray, sense: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ def _changes(problem: FamilyProblem, samples: Samples) -> list[_Change]:
     return changes
 
 
-def _located(track: Track, changes: Sequence[_Change], zones: Sequence[Zone]) -> list[Spot]:
+def _locate(track: Track, changes: Sequence[_Change], zones: Sequence[Zone]) -> list[Spot]:
     """Where the tests vanish; across a zone, by the secant through values that the other curve does
     not disturb.
     """
@@ -282,7 +282,7 @@ def _location_errors(
 _KNOWN = 1e-4
 
 
-def _told(
+def _describe(
     changes: Sequence[_Change],
     spots: Sequence[Spot],
     crossings: Sequence[Spot],
@@ -302,7 +302,7 @@ def _told(
                 else "stability_gained"
             )
             anchors = [*(folds if spot.kind == "above" else ()), *crossings]
-            bounds.append(_anchored(spot, anchors, problem.symmetry)._replace(kind=kind))
+            bounds.append(_anchor(spot, anchors, problem.symmetry)._replace(kind=kind))
         elif spot.kind.startswith("fold") or (
             _is_known(spot, problem.symmetry) and not overlaps(spot, crossings)
         ):
@@ -316,7 +316,7 @@ def _is_known(spot: Spot, symmetry: str) -> bool:
     return bool(measure_error(spot.row, symmetry)[0] < _KNOWN)
 
 
-def _anchored(spot: Spot, anchors: Sequence[Spot], symmetry: str) -> Spot:
+def _anchor(spot: Spot, anchors: Sequence[Spot], symmetry: str) -> Spot:
     """A change of stability, at the first place within its error that is known better and where c
     is as it says.
 

@@ -245,7 +245,7 @@ def test_a_search_out_of_steps_ends_and_says_so(paper, forty_and_steps):
     """It lists what it has: no other orbits than the whole search, and not without a doubt."""
     whole, told = forty_and_steps
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(release, "expected_steps", lambda *_: 1)
+        patch.setattr(release, "foresee_steps", lambda *_: 1)
         request = {"theta1": np.radians(40.0), "max_period": 2.0, "most_steps": told[-1][0] // 4}
         some = dpend.find_brake_orbits(paper, **request)
     assert (whole.coverage.exhausted, some.coverage.exhausted) == (False, True)

@@ -9,7 +9,7 @@ from elsewhere import FORTY
 
 import dpend
 from dpend.catalogue.bicubic import Cells as _Cells
-from dpend.catalogue.scan import Budget, scanned
+from dpend.catalogue.scan import Budget, scan_release
 from dpend.mechanics.units import natural
 
 
@@ -17,7 +17,7 @@ def scan(pendulum, theta1_deg, max_period, intervals=128):
     """Returns to rest, times in seconds."""
     second = float(np.sqrt(pendulum.l1 / pendulum.g))
     scaled = jax.tree.map(float, natural(pendulum))
-    result = scanned(
+    result = scan_release(
         scaled, float(np.radians(theta1_deg)), 0.5 * max_period / second, intervals, Budget(10**9)
     )
     return result, np.array([(zero.theta2, zero.time * second) for zero in result.zeros]).reshape(

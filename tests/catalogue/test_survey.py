@@ -175,7 +175,7 @@ def test_a_search_that_ran_out_of_steps_says_so_and_goes_on(paper, tmp_path):
     """What it took is at least what it was allowed; the whole follows from the store."""
     store = tmp_path / "search.json"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(survey, "expected_steps", lambda *_: 1)
+        patch.setattr(survey, "foresee_steps", lambda *_: 1)
         some = dpend.find_brake_families(paper, max_period=0.6, store=store, most_steps=600_000)
     assert some.coverage.exhausted
     assert 0 < some.coverage.slices < 31
