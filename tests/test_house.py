@@ -8,6 +8,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import house
+
 import dpend
 
 # Reading order. A file imports only files before it: those of the wings above, and those before it
@@ -34,6 +36,16 @@ map_picture plots animate report writing terminal options orbit_commands simulat
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
 LAZY = {("dpend", "plots"), ("dpend", "animate")}
+# Sizes: lines of a file, lines of code and McCabe's complexity of a function. What is above them
+# says why in a comment beside it, or waits to be written anew.
+LONGEST_FILE, LONGEST_FUNCTION, MOST_BRANCHES = 350, 40, 12
+LONG_FILES = {"orbits/find.py", "orbits/special.py", "motion/simulate.py", "mechanics/pendulum.py"}
+LONG_FUNCTIONS = {
+    "map_command", "atlas", "orbit", "simulate", "fit",  # options, one a line
+    "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation
+    "find_orbit", "check_gradient", "_dopri8",
+}  # fmt: skip
+BRANCHING = {"find_orbit", "_check_request", "follow_curve"}
 # The command line prints results and, on standard error, what it does.
 PRINTING = ["report", "terminal"]
 
@@ -123,3 +135,17 @@ print(*sorted({name.split('.')[0] for name in sys.modules}
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_files_and_functions_fit_a_sitting_and_a_screen():
+    lengths = {
+        path.relative_to(HOUSE).as_posix(): len(path.read_text().splitlines())
+        for path in HOUSE.rglob("*.py")
+    }
+    assert {name for name, length in lengths.items() if length > LONGEST_FILE} == LONG_FILES
+    functions = [function for path in HOUSE.rglob("*.py") for function in house.functions_of(path)]
+    long = {function.name for function in functions if function.code > LONGEST_FUNCTION}
+    assert long == LONG_FUNCTIONS
+    branching = {f.name for f in functions if f.complexity > MOST_BRANCHES}
+    assert branching == BRANCHING
+    assert [function.name for function in functions if not function.typed] == []
