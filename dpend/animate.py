@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from dpend.checks import function, instance, known_number, shown
+from dpend.mechanics.linear import fast_frequency
 from dpend.mechanics.pendulum import (
     Pendulum,
     State,
     check_motion,
     check_pendulum,
     check_state,
-    fast_frequency,
     positions,
 )
 from dpend.motion.simulate import Trajectory, simulate

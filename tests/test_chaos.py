@@ -11,7 +11,7 @@ import pytest
 
 import dpend
 from dpend import Scheme, chaos
-from dpend.mechanics.pendulum import equilibria
+from dpend.mechanics.linear import equilibria
 
 FAST = Scheme("rk8-circle-rescaled", 0.2)
 

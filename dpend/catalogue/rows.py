@@ -10,7 +10,8 @@ import numpy as np
 from jax import lax
 
 from dpend.maps.lanes import over_lanes
-from dpend.mechanics.pendulum import Pendulum, State, fast_frequency, vector_field
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum, State, vector_field
 from dpend.methods.scheme import Scheme
 
 # The stages as a loop: motions are few and of many kinds, and compiling would take longer than all

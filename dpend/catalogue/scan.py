@@ -1,5 +1,4 @@
-"""Every return to rest of one release angle: all zeros of the momenta on the rectangle of theta2
-and time.
+"""Every return to rest of one release angle: all zeros of the momenta over theta2 and time.
 
 With theta1 given, G(theta2, t) = p(t)/t of the motion released at (theta1, theta2) is a smooth map
 of a rectangle to the plane, and its zeros are the brake orbits; the division takes away the line t
@@ -40,7 +39,8 @@ from dpend.catalogue.bicubic import (
     turn_along,
 )
 from dpend.catalogue.rows import TooCoarse, release_rows, rows_for
-from dpend.mechanics.pendulum import Pendulum, fast_frequency
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum
 
 # Cells that are looked at together: as many as fit a cache.
 _BATCH = 512 * 320

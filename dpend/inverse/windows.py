@@ -29,15 +29,8 @@ from jaxtyping import Array
 
 from dpend.checks import Scalar
 from dpend.inverse.measurements import Angles, wrap
-from dpend.mechanics.pendulum import (
-    Pendulum,
-    State,
-    fast_frequency,
-    fastest,
-    momenta,
-    normal_modes,
-    velocities,
-)
+from dpend.mechanics.linear import fast_frequency, fastest, normal_modes
+from dpend.mechanics.pendulum import Pendulum, State, momenta, velocities
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import advance_state, step_size
 

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, State, check_pendulum, fast_frequency
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum, State, check_pendulum
 
 
 class Norm(NamedTuple):

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, State, fast_frequency
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum, State
 from dpend.mechanics.trig import sincos
 from dpend.methods.runge_kutta import Form, Step
 

@@ -22,7 +22,8 @@ import numpy as np
 from jax import lax
 
 from dpend.checks import Scalar, flag, instance, known_number, one_of
-from dpend.mechanics.pendulum import Pendulum, State, fast_frequency, hamiltonian, known_pendulum
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum, State, hamiltonian, known_pendulum
 from dpend.methods.circle import CIRCLE, spin_of
 from dpend.methods.gauss import GAUSS, SUMMED
 from dpend.methods.runge_kutta import (

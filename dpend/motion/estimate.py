@@ -12,14 +12,8 @@ import numpy as np
 from jax import lax
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import (
-    Pendulum,
-    State,
-    energy_scale,
-    fast_frequency,
-    hamiltonian,
-    vector_field,
-)
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum, State, energy_scale, hamiltonian, vector_field
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import Turns, march, step_size, without_turns
 

@@ -11,7 +11,8 @@ from jaxtyping import ArrayLike
 
 from dpend._runtime import require_float64
 from dpend.checks import Scalar, flag, integer, known_value, number, numbers, shown, single
-from dpend.mechanics.pendulum import Pendulum, State, check_motion, fast_frequency, vector_field
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum, State, check_motion, vector_field
 from dpend.mechanics.trig import LARGEST_ANGLE
 from dpend.motion.estimate import (
     EPS,

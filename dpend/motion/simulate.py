@@ -21,7 +21,8 @@ from dpend.checks import (
     one_of,
     shown,
 )
-from dpend.mechanics.pendulum import Pendulum, State, check_motion, fast_frequency
+from dpend.mechanics.linear import fast_frequency
+from dpend.mechanics.pendulum import Pendulum, State, check_motion
 from dpend.methods.runge_kutta import Point
 from dpend.methods.scheme import METHODS, Scheme
 from dpend.motion.estimate import (

@@ -24,7 +24,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, State, fast_frequency, fastest, vector_field
+from dpend.mechanics.linear import fast_frequency, fastest
+from dpend.mechanics.pendulum import Pendulum, State, vector_field
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import advance_state, step_size
 from dpend.orbits.stability import transition

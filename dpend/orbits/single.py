@@ -12,7 +12,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, State, fastest, normal_modes, released, vector_field
+from dpend.mechanics.linear import fastest, normal_modes
+from dpend.mechanics.pendulum import Pendulum, State, released, vector_field
 from dpend.methods.scheme import Scheme
 from dpend.motion.integrate import march, step_size
 from dpend.status import Status

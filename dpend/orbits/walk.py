@@ -13,7 +13,8 @@ from jax import lax
 from jaxtyping import Array
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, equilibria, momenta, normal_modes
+from dpend.mechanics.linear import equilibria, normal_modes
+from dpend.mechanics.pendulum import Pendulum, momenta
 from dpend.orbits.arc import LOG_DELTA, SEGMENTS, Arc
 from dpend.orbits.newton import METRIC, ROW, Aim, Solved, correct
 
