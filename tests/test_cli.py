@@ -76,7 +76,7 @@ def test_a_design(capsys):
     status, out, _ = run(capsys, *command, "--bounds", "l1=0.15:0.25", "--bounds", "l2=0.15:0.25")
     assert status == 1
     assert "at bounds: l1, l2" in out
-    assert "no_solution: No solution was found within the bounds" in out
+    assert "no_solution: Nothing within the bounds satisfies the equations" in out
     status, both = run_json(capsys, "design", "--theta1", 60, "--ratio", 2, "--free", "l1,l2")
     slow, fast = both["orbits"]
     assert (status, slow["branch"], fast["branch"]) == (0, "in-phase", "anti-phase")
@@ -549,9 +549,8 @@ def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_the_atlas_of_the_square(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        cli, "_BETWEEN_LINES", float("inf")
-    )  # a slow machine would tell how far it is
+    # A slow machine would tell how far it is.
+    monkeypatch.setattr(terminal, "_BETWEEN_LINES", float("inf"))
     store = tmp_path / "s.json"
     status, found = run_json(capsys, "atlas", "--max-period", 1.0, "--store", store)
     assert (status, [one["family"] for one in found["families"]]) == (0, ["C1", "C2", "C3"])
