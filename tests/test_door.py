@@ -382,7 +382,7 @@ DOORS = {
                 [PAPER],
             )
         },
-        "dpend.mechanics.pendulum._modes",
+        "dpend.mechanics.linear._modes",
     ),
     "equilibria": Door(dpend.equilibria, {"pendulum": PAPER}, {"pendulum": kind(ONE_PENDULUM[0])}),
     "Scheme": Door(
