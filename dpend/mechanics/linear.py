@@ -1,7 +1,7 @@
 """Linear motion: normal modes, equilibria with their exponents, the rates that decide a step."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +24,9 @@ class NormalMode:
         period: 2 pi/frequency [s].
     """
 
-    frequency: Scalar
+    frequency: Annotated[Scalar, "rad/s"]
     ratio: Scalar
-    period: Scalar
+    period: Annotated[Scalar, "s"]
 
 
 @jax.tree_util.register_dataclass
