@@ -215,16 +215,21 @@ def bounds_in(texts: list[str]) -> dict[str, tuple[float, float]]:
     bounds = {}
     for text in texts:
         name, _, span = text.partition("=")
-        try:
-            low, high = (parse_decimal(part) for part in span.split(":"))
-        except ValueError:
-            raise ValueError(
-                f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5"
-            ) from None
+        refusal = f"bounds must be NAME=A:B, got {text!r}: give one like l1=0.1:0.5"
+        low, high = _span_in(span, refusal)
         if name in bounds:
             raise ValueError(f"bounds must be given once a name, got {name} twice: leave one out")
         bounds[name] = (math.radians(low), math.radians(high)) if name == "theta1" else (low, high)
     return bounds
+
+
+def _span_in(text: str, refusal: str) -> tuple[float, float]:
+    """The two numbers of A:B."""
+    try:
+        low, high = (parse_decimal(part) for part in text.split(":"))
+    except ValueError:
+        raise ValueError(refusal) from None
+    return low, high
 
 
 def size_in(text: str) -> tuple[int, int]:
@@ -248,12 +253,8 @@ def cells_in(name: str, text: str, count: int) -> np.ndarray:
     """The centres [rad] of `count` cells of a range A:B [deg]; a symmetric range is one half and
     its mirror image.
     """
-    try:
-        start, end = (float(part) for part in text.split(":"))
-    except ValueError:
-        raise ValueError(
-            f"{name} must be a range A:B in degrees, got {text!r}: give one like -180:180"
-        ) from None
+    refusal = f"{name} must be a range A:B in degrees, got {text!r}: give one like -180:180"
+    start, end = _span_in(text, refusal)
     if not (math.isfinite(start) and math.isfinite(end) and start < end):
         raise ValueError(
             f"{name} must be a range A:B with A below B, got {text!r}: give one like -180:180"
