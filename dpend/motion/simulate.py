@@ -120,7 +120,72 @@ def simulate(
         )
     wish = TOLERANCE if tolerance is None else tolerance
     tolerance = known_number("tolerance", wish, positive=True, unit="rad")
-    raise NotImplementedError
+    check_mechanics(pendulum, state)
+    end, grid = _span(pendulum, state, duration, times, every)
+    asked = end, tolerance, most_steps
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((pendulum, state, end, grid))):
+        if every is not None:
+            raise ValueError(
+                "save_every must not be given where the motion is traced, whose steps are not "
+                f"known, got {shown(save_every)}: give times"
+            )
+        return _traced(pendulum, state, grid, asked)
+    lanes = np.broadcast_shapes(*(np.shape(leaf) for leaf in jax.tree.leaves((pendulum, state))))
+    if len(lanes) > 1 or (lanes and every is not None):
+        raise ValueError(
+            f"state must have one dimension at most, and none with save_every, got shape {lanes}: "
+            f"reshape it, or give times"
+        )
+    if every is not None:
+        return _at_steps(pendulum, state, asked, every)
+    return _many(pendulum, state, grid, asked, lanes[0]) if lanes else _one(pendulum, state, grid, asked)
+
+
+def _check_duration(duration: Any) -> float:
+    known = known_duration(duration)
+    if known is None or known == 0.0:
+        raise ValueError(
+            f"duration must be a finite number [s] other than zero, known before tracing, got "
+            f"{shown(duration)}: "
+            "give another duration"
+        )
+    return known
+
+
+def _span(
+    pendulum: Pendulum, state: State, duration: Any, times: Any, every: int | None
+) -> tuple[Any, Any]:
+    """The end of the motion [s], and its saved times; None for those with `every`."""
+    if duration is None and times is None:
+        raise ValueError("duration must be given where times are not, got None: give one of them")
+    if times is None:
+        known = _check_duration(duration)
+        share = None if every is not None else np.linspace(0.0, 1.0, _count_times(pendulum, state, known))
+        return duration, None if share is None else share * duration
+    grid = jnp.asarray(times, jnp.float64) if isinstance(times, jax.core.Tracer) else check_times(times)
+    if duration is None:
+        return grid[-1], grid
+    known = _check_duration(duration)
+    if not isinstance(grid, jax.core.Tracer) and (abs(grid[-1]) > abs(known) or grid[-1] * known < 0):
+        raise ValueError(
+            f"times must lie between zero and the duration of {known:g} s, got {shown(grid)}: "
+            f"give a longer duration, or none"
+        )
+    return duration, grid
+
+
+def _count_times(pendulum: Pendulum, state: State, duration: float) -> int:
+    leaves = jax.tree.leaves((pendulum, state))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return _TIMES_UNKNOWN
+    rate = float(np.max(np.nan_to_num(fastest_of_all(pendulum, state), posinf=0.0)))
+    count = 2 + math.ceil(_TIMES_A_RADIAN * rate * abs(duration))
+    if count > MOST_MOTION_STEPS:
+        raise ValueError(
+            f"duration must be at most some {MOST_MOTION_STEPS / rate / _TIMES_A_RADIAN:.1e} s "
+            f"where all of a motion is saved, got {duration:g}: give times"
+        )
+    return count
 
 
 def _check_method(method: Any, default: str) -> str:
