@@ -448,13 +448,13 @@ DOORS = {
             "error": FLAG,
             "tolerance": kind(POSITIVE[0][1:]),
         },
-        "dpend.motion.simulate._simulate",
+        "dpend.motion.stepped._simulate",
     ),
     "simulate, for a tolerance": Door(
         dpend.simulate,
         {"pendulum": PAPER, "state": RELEASE, "duration": 1.0},
         {"tolerance": MAYBE_POSITIVE},
-        "dpend.motion.simulate.find_scheme",
+        "dpend.motion.simulate._one",
     ),
     "reference": Door(
         dpend.reference,

@@ -83,9 +83,7 @@ def save_at_times(
     start = _natural(pendulum, state, end)
     ahead = jnp.where(jnp.isfinite(times), times * start.forth, jnp.inf)
     last = end * start.forth
-    saved: Saved = natural_motion(
-        start.begin, start.constants, ahead, last, tolerance, most_steps
-    )
+    saved: Saved = natural_motion(start.begin, start.constants, ahead, last, tolerance, most_steps)
     moved = momenta(pendulum, *saved.angles, *(saved.rates * start.forth))
     # The start itself, to the last bit; the derivatives there are the motion's.
     at_start = lax.stop_gradient(times == 0.0)
@@ -99,7 +97,11 @@ def save_at_times(
 
 
 def save_at_steps(
-    pendulum: Pendulum, state: State, end: Scalar, wish: tuple[Scalar, Scalar], every: Scalar,
+    pendulum: Pendulum,
+    state: State,
+    end: Scalar,
+    wish: tuple[Scalar, Scalar],
+    every: Scalar,
     room: int,
 ) -> tuple[SavedMotion, Any, Scalar]:
     """States at the ends of every `every`-th step and of the last one, in `room` columns; their

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 
-from dpend.checks import Scalar
+from dpend.checks import Scalar, numbers, shown
 from dpend.mechanics.pendulum import State
 from dpend.methods.scheme import Scheme
 from dpend.motion.estimate import MARGIN, PARTED
@@ -99,8 +99,10 @@ class Trajectory:
         attributes: dict[str, Any] = {"tolerance_rad": float(self.tolerance), "method": self.method}
         if lanes:
             status = np.asarray(self.status, np.uint8)
-            meanings = {"flag_values": np.array(list(Status), np.uint8),
-                        "flag_meanings": " ".join(one.name.lower() for one in Status)}
+            meanings = {
+                "flag_values": np.array(list(Status), np.uint8),
+                "flag_meanings": " ".join(one.name.lower() for one in Status),
+            }
             data |= {name: (lanes, value) for name, value in told.items()}
             data["status"] = (lanes, status, meanings)
         else:
@@ -115,3 +117,24 @@ def _count_statuses(status: np.ndarray) -> str:
     values, counts = np.unique(status, return_counts=True)
     told = sorted(zip(counts.tolist(), values.tolist(), strict=True), reverse=True)
     return " ".join(f"{count} of {status.size}: {message(value)}" for count, value in told)
+
+
+def check_times(times: Any) -> np.ndarray:
+    """The times [s], if they move away from zero in one direction."""
+    grid = np.atleast_1d(numbers("times", times, unit="s"))
+    if grid.ndim != 1:
+        raise ValueError(
+            f"times must have one dimension, got shape {grid.shape}: give one number for each time"
+        )
+    moves = np.diff(grid, prepend=0.0)
+    ordered = (
+        np.all(moves[1:] > 0) and grid[0] >= 0
+        if grid.size and grid[-1] > 0
+        else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
+    )
+    if not grid.size or not np.all(np.isfinite(grid)) or not ordered:
+        raise ValueError(
+            f"times must be finite and move away from zero in one direction, got {shown(grid)}: "
+            f"sort them"
+        )
+    return grid

@@ -18,7 +18,13 @@ from dpend.mechanics.trig import sincos
 from dpend.methods.collocation import Field, Pair, accelerations, integrate, over_step, step
 from dpend.methods.nodes import NODES, TABLES
 from dpend.motion.adaptive import (
-    Saved, goes_on, one_after_another, run, save, start_pair, values_at
+    Saved,
+    goes_on,
+    one_after_another,
+    run,
+    save,
+    start_pair,
+    values_at,
 )
 
 # Sweeps of the variational equation end at this share of the largest derivative, or after so many.
@@ -100,13 +106,9 @@ def _beside(field: Field, times: Any, end: Scalar, stop: Scalar, beside: _Beside
 
     rows, following = save(times, good, h, taken.pair.time, values, (beside.rows, beside.next))
     r = taken.pair.h / h
-    kept = [
-        jnp.where(good, new, old)
-        for new, old in zip(
-            (angles, rates, series), (beside.angles, beside.rates, beside.guess), strict=True
-        )
-    ]
-    return _Beside(taken.pair, *kept[:2], kept[2] * r**_POWER, rows, following, beside.steps + good)
+    angles, rates = jnp.where(good, angles, beside.angles), jnp.where(good, rates, beside.rates)
+    guess = jnp.where(good, series, beside.guess) * r**_POWER
+    return _Beside(taken.pair, angles, rates, guess, rows, following, beside.steps + good)
 
 
 @one_after_another
