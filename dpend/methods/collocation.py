@@ -218,8 +218,8 @@ def step(field: Field, end: Scalar, stop: Scalar, pair: Pair) -> Step:
     """
     h = pair.h
     rounds, tail = solve(field, pair, stop), tail_of(stop)
-    last = rounds.values - _LAG * (rounds.values - rounds.before)
-    f = jnp.stack([last.real, last.imag])
+    values, before = (jnp.stack([z.real, z.imag]) for z in (rounds.values, rounds.before))
+    f = values - _LAG * (values - before)
     within = h * h * over_step(TABLES.ends[1], f) + h * pair.rate_rests
     turned = within + h * pair.rates
     angles, angle_rests = _summed(pair.angles, pair.angle_rests, turned)

@@ -123,10 +123,10 @@ def start_pair(begin: Any, end: Scalar, stop: Scalar) -> Pair:
 
 def values_at(x: Any, h: Scalar, angles: Any, rates: Any, series: Any) -> Any:
     """Angles and rates at x = (t - end)/h <= 0 from a step's series, shape (2 m, times)."""
-    power = np.arange(series.shape[-1])
+    power = np.arange(float(series.shape[-1]))
     twice, once = series / ((power + 1) * (power + 2)), series / (power + 1)
     second = first = jnp.zeros((*series.shape[:-1], x.size))
-    for j in reversed(power):
+    for j in reversed(range(power.size)):
         second, first = second * x + twice[..., j, None], first * x + once[..., j, None]
     at = angles[..., None] + x * (h * rates[..., None] + (h * h) * x * second)
     return jnp.concatenate([at, rates[..., None] + (h * x) * first], axis=-2)
@@ -168,15 +168,16 @@ def _save_step(every: Scalar, end: Scalar, along: _Along, taken: Step, worst: Sc
     pair = taken.pair
     column = jnp.concatenate([pair.angles[:, 0], pair.rates[:, 0], jnp.stack([worst, pair.time])])
     rows = lax.dynamic_update_slice(along.rows, column[:, None], (jnp.asarray(0), along.next))
-    wanted = ((along.steps + 1) % every == 0) | (pair.time >= end)
-    return rows, along.next + (taken.good & wanted)
+    wanted = ((along.steps + 1.0) % every == 0.0) | (pair.time >= end)
+    return rows, along.next + (taken.good & wanted).astype(int)
 
 
 def _advance(field: Field, end: Scalar, keep: Keep, stop: Scalar, along: _Along) -> _Along:
     taken = step(field, end, stop, along.pair)
     worst = jnp.where(taken.good, jnp.maximum(along.worst, taken.gap), along.worst)
     rows, following = keep(along, taken, worst)
-    return _Along(taken.pair, rows, following, worst, along.steps + taken.good)
+    steps = along.steps + taken.good.astype(float)
+    return _Along(taken.pair, rows, following, worst, steps)
 
 
 def goes_on(end: Scalar, most_steps: Scalar, pair: Pair, steps: Scalar) -> Scalar:
@@ -208,7 +209,7 @@ def _adapt(
         along = lax.while_loop(
             lambda a: goes_on(end, most_steps, a.pair, a.steps) & (a.worst <= limit),
             partial(_advance, field, end, keep, stop),
-            _Along(start_pair(begin, end, stop), rows, none, least, none),
+            _Along(start_pair(begin, end, stop), rows, none, least, zero),
         )
         reached = along.pair.time
         met = (reached == end) & (along.worst <= tolerance)
@@ -221,7 +222,7 @@ def _adapt(
         )  # fmt: skip
 
     stop = jnp.maximum(_FIRST_STOP * tolerance, _FINEST)
-    first = _Try(rows, none, zero, zero, none, stop, stop, none, jnp.asarray(False))
+    first = _Try(rows, none, zero, zero, zero, stop, stop, none, jnp.asarray(False))
     last: _Try = lax.while_loop(lambda t: ~t.done, again, first)
     return last
 
@@ -256,5 +257,5 @@ def run_steps(
 
 
 def _saved(best: _Try, worst: Scalar) -> Saved:
-    rows, steps = best.rows, best.steps.astype(float)
-    return Saved(rows[:2], rows[2:4], rows[4], worst, best.reached, steps, best.stop)
+    rows = best.rows
+    return Saved(rows[:2], rows[2:4], rows[4], worst, best.reached, best.steps, best.stop)

@@ -298,7 +298,7 @@ def _many(pendulum: Pendulum, state: State, times: Any, asked: tuple, lanes: int
 def _at_steps(pendulum: Pendulum, state: State, asked: tuple, every: int) -> Trajectory:
     room, count, numbers = _LEAST_ROOM, math.inf, _numbers(pendulum, state, asked)
     while True:
-        rows, count = _compiled_steps(numbers, every, room)
+        rows, count = _compiled_steps(numbers, float(every), room)
         if int(count) < room:
             break
         room = _room(int(count) + 1)

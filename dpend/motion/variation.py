@@ -29,7 +29,7 @@ from dpend.motion.adaptive import (
 
 # Sweeps of the variational equation end at this share of the largest derivative, or after so many.
 _LINEAR_STOP, _MOST_LINEAR_SWEEPS = 1e-14, 60
-_POWER = np.arange(NODES)
+_POWER = np.arange(float(NODES))
 _UNKNOWNS = 7  # angles, rates, and the field's constants
 
 
@@ -108,7 +108,9 @@ def _beside(field: Field, times: Any, end: Scalar, stop: Scalar, beside: _Beside
     r = taken.pair.h / h
     angles, rates = jnp.where(good, angles, beside.angles), jnp.where(good, rates, beside.rates)
     guess = jnp.where(good, series, beside.guess) * r**_POWER
-    return _Beside(taken.pair, angles, rates, guess, rows, following, beside.steps + good)
+    return _Beside(
+        taken.pair, angles, rates, guess, rows, following, beside.steps + good.astype(float)
+    )
 
 
 @one_after_another
@@ -119,7 +121,7 @@ def _sensitivities(
     unit = jnp.eye(_UNKNOWNS)
     first = _Beside(
         start_pair(begin, end, stop), unit[:, :2], unit[:, 2:4], jnp.zeros((_UNKNOWNS, 2, NODES)),
-        jnp.zeros((_UNKNOWNS, 4, times.size)), none, none,
+        jnp.zeros((_UNKNOWNS, 4, times.size)), none, jnp.asarray(0.0),
     )  # fmt: skip
     last = lax.while_loop(
         lambda beside: goes_on(end, most_steps, beside.pair, beside.steps),

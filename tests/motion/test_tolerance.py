@@ -121,7 +121,8 @@ def test_what_does_not_come_to_its_end_says_so(paper):
     short = dpend.simulate(paper, RELEASE, times=[0.05, 2.0], most_steps=5)
     assert short.status == Status.MAX_ITERATIONS
     assert np.isinf(short.error_estimate)
-    assert np.isfinite(short.state.theta1[0]) and np.isnan(short.state.theta1[1])
+    assert np.isfinite(short.state.theta1[0])
+    assert np.isnan(short.state.theta1[1])
     with pytest.raises(ValueError, match="state must have one dimension at most"):
         dpend.simulate(paper, State(*np.zeros((4, 2, 2))), 1.0)
     with pytest.raises(ValueError, match="duration must be at most some .* give times"):
