@@ -39,6 +39,9 @@ _TAIL_POWER, _TAIL_FACTOR = 0.43, 6.0
 _TOO_LARGE = 20.0
 # From one step to the next the length changes by these factors at most.
 _SHORTER, _LONGER = 0.5, 1.5
+# No step is longer, in units in which the fastest motion at the start turns by 1 to 2 rad: a motion
+# near rest has no last coefficient that would bound its steps.
+_LONGEST_STEP = 1.0
 # The companion goes without this share of its last sweep, the solution with all of it: what sweeps
 # still lack
 # is less, as long as each change is at most a sixth of the one before.
@@ -261,7 +264,7 @@ def _longer(series: Any, gap: Scalar) -> Any:
 def _scaled(pair: Pair, good: Scalar, room: Scalar, end: Scalar) -> Pair:
     """The pair with the next step's length, and the guess in its units."""
     factor = jnp.where(good, jnp.clip(eighth_root(room), _SHORTER, _LONGER), _SHORTER)
-    left, wanted = end - pair.time, factor * pair.h
+    left, wanted = end - pair.time, jnp.minimum(factor * pair.h, _LONGEST_STEP)
     last = wanted >= left * (1 - 1e-12)
     # The length that the sum of times makes of it: times then are exact.
     h = jnp.where(last, left, (pair.time + wanted) - pair.time)
