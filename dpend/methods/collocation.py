@@ -41,7 +41,7 @@ _TOO_LARGE = 20.0
 _SHORTER, _LONGER = 0.5, 1.5
 # No step is longer, in units in which the fastest motion at the start turns by 1 to 2 rad: a motion
 # near rest has no last coefficient that would bound its steps.
-_LONGEST_STEP = 1.0
+_LONGEST_STEP = 2.0
 # The companion goes without this share of its last sweep, the solution with all of it: what sweeps
 # still lack
 # is less, as long as each change is at most a sixth of the one before.
@@ -67,7 +67,10 @@ _COS = (
     -2.755731906601836e-07, 2.0876747998956077e-09, -1.1470428756318817e-11, 4.7727170677565235e-14,
     -1.481728731207381e-16,
 )  # fmt: skip
-_LAST = (NODES - 1, NODES - 4)
+# Where changes are looked at, (row, node): the last nodes are the last to settle, and one alone may
+# stand still by chance. At rest the solution stands still for ever, and a companion that never
+# settled would grow.
+_LOOKED_AT = ((0, NODES - 1), (1, NODES - 4))
 _ONE = int(np.float64(1.0).view(np.int64))
 
 
@@ -181,8 +184,7 @@ def _sweep(field: Field, h: Scalar, rates: Any, trig: tuple, last: _Round) -> _R
         rate = w + h * integrate(TABLES.first, f)
         rods.append((s0 * cosine + c0 * sine, c0 * cosine - s0 * sine, rate))
     new = lax.complex(*accelerations(field, *rods))
-    # Row 0's last nodes are the last to settle; one alone may stand still by chance.
-    changes = [new[0, node] - old[0, node] for node in _LAST]
+    changes = [new[row, node] - old[row, node] for row, node in _LOOKED_AT]
     change = jnp.max(jnp.stack([jnp.abs(x) for c in changes for x in (c.real, c.imag)]))
     return _Round(new, old, change, last.count + 1)
 
