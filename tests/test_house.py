@@ -20,7 +20,7 @@ _version _runtime checks places status records
 mechanics.trig mechanics.pendulum mechanics.linear mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.nodes methods.collocation methods.scheme
 motion.integrate motion.estimate motion.trajectory motion.adaptive motion.variation motion.saved
-motion.stepped motion.simulate motion.reference motion.root motion.events
+motion.stepped motion.tables motion.simulate motion.reference motion.root motion.events
 motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep

@@ -26,14 +26,13 @@ from dpend.mechanics.trig import sincos
 from dpend.methods.nodes import NODES, TABLES
 
 # Sweeps of one step: fewer than two leave the companion's guess in the estimate; a step that takes
-# more than
-# so many is too long, as the changes then fall by less than a factor of five each.
+# more than so many is too long, as the changes then fall by less than a factor of five each.
 _LEAST_SWEEPS, _MOST_SWEEPS = 2, 16
 # The turn of a rod in one step [rad], for which the polynomials below hold up to 2.
 _LARGEST_TURN = 1.9
 # The last coefficient of the accelerations is held at this power of the change at which sweeps end,
-# times
-# this factor: steps and sweeps then take about the same time at tolerances from 1e-3 to 1e-12.
+# times this factor: steps and sweeps then take about the same time at tolerances from 1e-3 to
+# 1e-12.
 _TAIL_POWER, _TAIL_FACTOR = 0.43, 6.0
 # A step whose last coefficient is so many times larger is taken back.
 _TOO_LARGE = 20.0
@@ -43,17 +42,15 @@ _SHORTER, _LONGER = 0.5, 1.5
 # near rest has no last coefficient that would bound its steps.
 _LONGEST_STEP = 2.0
 # The companion goes without this share of its last sweep, the solution with all of it: what sweeps
-# still lack
-# is less, as long as each change is at most a sixth of the one before.
+# still lack is less, as long as each change is at most a sixth of the one before.
 _LAG = np.array([[0.0], [0.2]])
 # The rows' errors may have one sign and hide in their difference: the estimate is so many
 # differences.
-_CAUTION = 1.25
+_CAUTION = 1.6
 # Beyond this difference [rad] the companion tells nothing of the solution's next powers.
 _PARTED = 1e-3
 # What a saved state within the step lacks [rad], if the last coefficient of the accelerations is
-# one: it falls
-# like three powers more.
+# one: it falls like three powers more.
 _MISSING = 2e-8
 
 # sin(d)/d and cos(d) in powers of d^2 for |d| <= 2: Chebyshev interpolation, errors 1.6e-16 and
