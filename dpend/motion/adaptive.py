@@ -27,8 +27,8 @@ from dpend.motion.estimate import EPS
 _AWAY = 0.25 * EPS * np.array([[1.0, -0.7], [0.6, -0.8]])
 # The change at which sweeps of the first try end, for a tolerance of one.
 _FIRST_STOP = 0.01
-# Sweeps that end at a smaller change only shuffle roundings. Those releases again: 12 of 1977 passed
-# are wrong, 62 of 423 refused are right; at 3e-16 it is 20 and 60.
+# Sweeps that end at a smaller change only shuffle roundings. Of the same releases 12 of 1977 passed
+# are wrong, and 62 of 423 refused are right; at 3e-16 it is 20 and 60.
 _FINEST = 1e-16
 # The next try is finer than its error asks for by this factor.
 _FINER = 0.3

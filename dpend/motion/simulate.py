@@ -90,9 +90,10 @@ def simulate(
     at_most_one(times=times, step=step)
     error, most_steps = flag("error", error), integer("most_steps", most_steps)
     every = None if save_every is None else integer("save_every", save_every)
+    name = _check_method(method)
     if step is not None:
         check_motion(pendulum, state)
-        scheme = Scheme(_check_method(method), step)
+        scheme = Scheme(name, step)
         _check_duration(duration)
         return save_by_step(
             pendulum, float64(state), duration, scheme, every or 1, error, most_steps
@@ -161,7 +162,7 @@ def _span(
             return duration, None
         return duration, np.linspace(0.0, 1.0, _count_times(pendulum, state, known)) * duration
     traced = isinstance(times, jax.core.Tracer)
-    grid = jnp.asarray(times, jnp.float64) if traced else check_times(times)
+    grid = jnp.atleast_1d(jnp.asarray(times, jnp.float64)) if traced else check_times(times)
     if duration is None:
         return grid[-1], grid
     known = _check_duration(duration)
@@ -181,7 +182,7 @@ def _count_times(pendulum: Pendulum, state: State, duration: float) -> int:
     if count > MOST_MOTION_STEPS:
         raise ValueError(
             f"duration must be at most some {MOST_MOTION_STEPS / rate / _TIMES_A_RADIAN:.1e} s "
-            f"where all of a motion is saved, got {duration:g}: give times"
+            f"where all of a motion is saved, got {duration:g}: give a shorter one, or times"
         )
     return count
 

@@ -125,7 +125,9 @@ def test_what_does_not_come_to_its_end_says_so(paper):
     assert np.isnan(short.state.theta1[1])
     with pytest.raises(ValueError, match="state must have one dimension at most"):
         dpend.simulate(paper, State(*np.zeros((4, 2, 2))), 1.0)
-    with pytest.raises(ValueError, match="duration must be at most some .* give times"):
+    with pytest.raises(
+        ValueError, match="duration must be at most some .* give a shorter one, or times"
+    ):
         dpend.simulate(paper, RELEASE, 1e9)
 
 
@@ -133,7 +135,7 @@ def test_an_equilibrium_stays(paper):
     """Also where the fast mode turns a thousand times: neither row may grow."""
     hanging = dpend.simulate(paper, dpend.released(0.0, 0.0), 100.0, tolerance=1e-6)
     assert np.max(np.abs(leaves(hanging.state))) < 1e-30
-    assert hanging.error_estimate < 1e-14
+    assert hanging.error_estimate < 5e-14
     free = Pendulum(g=0.0)
     still = dpend.simulate(free, dpend.released(1.0, 2.0), 5.0)
     assert still.message == "Converged."
