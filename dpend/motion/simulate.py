@@ -114,7 +114,8 @@ def _for_tolerance(
     pendulum: Pendulum, state: State, grid: Any, every: int | None, asked: tuple
 ) -> Trajectory:
     """The motions at the times of `grid`, or at the ends of steps where that is None."""
-    lanes = np.broadcast_shapes(*(np.shape(leaf) for leaf in jax.tree.leaves((pendulum, state))))
+    shapes = {np.shape(leaf) for leaf in jax.tree.leaves((pendulum, state))} - {()}
+    lanes = np.broadcast_shapes(*shapes) if shapes else ()
     if _is_traced((pendulum, state, asked[0], grid)):
         if every is not None:
             raise ValueError(

@@ -73,13 +73,17 @@ def _compiled_steps(numbers: Any, every: Any, room: int) -> Any:
 
 
 def _numbers(pendulum: Pendulum, state: State, asked: tuple) -> np.ndarray:
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((pendulum, state))]
-    return np.stack(np.broadcast_arrays(*leaves, *asked), axis=-1)
+    return np.array([*jax.tree.leaves((pendulum, state)), *asked], dtype=float)
+
+
+def _numbers_of_lanes(pendulum: Pendulum, state: State, asked: tuple, lanes: int) -> np.ndarray:
+    leaves = [np.asarray(leaf, float) for leaf in (*jax.tree.leaves((pendulum, state)), *asked)]
+    return np.stack([np.broadcast_to(leaf, lanes) for leaf in leaves], axis=-1)
 
 
 def _make(times: Any, rows: Any, told: Any, tolerance: float, columns: slice) -> Trajectory:
     """The result from tables (..., row, column) and what their last columns tell (..., 4)."""
-    drift, estimate, steps, status = np.moveaxis(told, -1, 0)
+    drift, estimate, steps, status = (told[..., i] for i in range(4))
     leaves = [rows[..., i, columns] for i in range(5)]
     state = jax.tree.unflatten(_STATE, leaves[:4])  # not checked: a lost motion is NaN
     return Trajectory(
@@ -101,7 +105,7 @@ def many_motions(
     n, devices = len(times), jax.local_devices()
     room = max(_LEAST_BLOCK_ROOM, 1 << (n + NODES - 1).bit_length())
     size = max(1, min(_LARGEST_BLOCK, _COLUMNS_OF_A_BLOCK // room))
-    numbers, padded = _numbers(pendulum, state, asked), _pad(times, room)
+    numbers, padded = _numbers_of_lanes(pendulum, state, asked, lanes), _pad(times, room)
     blocks = -(-lanes // size)
     filled = np.concatenate([numbers, np.repeat(numbers[-1:], blocks * size - lanes, axis=0)])
     waiting: list[Any] = []

@@ -126,13 +126,10 @@ def check_times(times: Any) -> np.ndarray:
         raise ValueError(
             f"times must have one dimension, got shape {grid.shape}: give one number for each time"
         )
-    moves = np.diff(grid, prepend=0.0)
-    ordered = (
-        np.all(moves[1:] > 0) and grid[0] >= 0
-        if grid.size and grid[-1] > 0
-        else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
-    )
-    if not grid.size or not np.all(np.isfinite(grid)) or not ordered:
+    way = np.sign(grid[-1:])
+    moves = way * (grid[1:] - grid[:-1])
+    ordered = grid.size and (way * grid[0]).item() >= 0 and moves.min(initial=np.inf) > 0
+    if not ordered or not np.isfinite(grid).all():
         raise ValueError(
             f"times must be finite and move away from zero in one direction, got {shown(grid)}: "
             f"sort them"
