@@ -1,8 +1,8 @@
 """Multiple shooting: a symmetric orbit in segments, and the step from one orbit of a family to the
 next.
 
-A quarter (centred) or half (brake, odd) of the period is cut into segments that are integrated side
-by side, each from its own initial state, the node; Newton's method makes their ends meet. No
+A quarter (centred), half (brake, odd, passing) or the whole (none) of the period is cut into segments
+that are integrated side by side, each from its own initial state, the node; Newton's method makes their ends meet. No
 segment is long enough for the motion to forget where it began, so that orbits can be followed to
 where kappa is 1e40 and shooting in one piece would see noise.
 
@@ -34,9 +34,11 @@ from dpend.orbits.stability import transition
 SEGMENTS = 16
 UNKNOWNS = 4 * SEGMENTS + 2
 # The conditions at the ends of the arc, by symmetry; the index is what compiled code is told.
-SYMMETRIES = ("centred", "brake", "odd")
+SYMMETRIES = ("centred", "brake", "odd", "passing", "none")
+PASSING = SYMMETRIES.index("passing")
+RELEASED_SYMMETRIES = ("centred", "brake")
 # What part of the period the arc is.
-PARTS = {"centred": 4, "brake": 2, "odd": 2}
+PARTS = {"centred": 4, "brake": 2, "odd": 2, "passing": 2, "none": 1}
 
 # Only its method is used: the number of steps is settled arc by arc. With its stages as a loop it
 # takes twice the time, and a tenth of it to compile.
@@ -47,13 +49,13 @@ TURN = 0.14
 MOST_SEGMENT_STEPS = 5_000
 
 # Where the unknowns are: the nodes one after the other, log Delta, and the unfolding parameter of
-# odd orbits, which is zero on every orbit.
+# odd orbits and of those without symmetry, which is zero on every orbit.
 LOG_DELTA, UNFOLDING = 4 * SEGMENTS, 4 * SEGMENTS + 1
 
 
 class Arc(NamedTuple):
-    """What is asked of an arc: the index of its symmetry, and the full turns of its end (theta/pi
-    if centred, else theta(0) + theta(T/2) in units of 2 pi).
+    """What is asked of an arc: the index of its symmetry, and the turns of its end (theta/pi if
+    centred or passing; in units of 2 pi theta(0) + theta(T/2) if odd, theta(T) - theta(0) if none).
     """
 
     symmetry: Any
@@ -151,33 +153,60 @@ def end_conditions(
     - odd: x(T/2) = -x(0) up to full turns, where the upper rod is at its extreme, theta1' = 0.
       Energy is conserved, so that these are one too many for the period and the state; the
       unfolding parameter times grad H, added to them, is zero at every solution (Munoz-Almaraz et
-      al., Physica D 181 (2003)).
+      al., Physica D 181 (2003));
+    - passing: theta(0) = 0 modulo pi, theta(T/2) = pi turns;
+    - none: x(T) = x(0) but for full turns, unfolded as odd orbits are, where the potential energy V
+      is at an extreme, theta' . grad V = 0: every periodic orbit has such a place.
     """
     full_turns = jnp.append(2 * jnp.pi * arc.turns, jnp.zeros(2))
 
-    def gradient_and_rate(start: Array) -> Array:
+    def gradient_and_power(start: Array) -> Array:
         slope = _field(pendulum, State(*start))
-        return jnp.concatenate([-slope[2:], slope[:2]])
+        pull = _field(pendulum, State(*start[:2], *jnp.zeros(2)))[2:]  # -grad V
+        return jnp.concatenate([-slope[2:], slope[:2], -(slope[:2] @ pull)[None]])
 
-    gradient, curvature = gradient_and_rate(start), jax.jacfwd(gradient_and_rate)(start)
+    gradient, power = jnp.split(gradient_and_power(start), [4])
+    curvature, change = jnp.split(jax.jacfwd(gradient_and_power)(start), [4])
+    by_end = unfolding * curvature, jnp.eye(4), gradient
+
+    def unfolded(sign: float, phase: Array) -> Array:
+        """The derivative of end + sign start + unfolding gradient, and of the phase."""
+        rows = jnp.column_stack([sign * jnp.eye(4) + by_end[0], *by_end[1:]])
+        return jnp.concatenate([rows, jnp.append(phase, jnp.zeros(5))[None]])
+
     value = jnp.stack([
         jnp.concatenate([start[2:], end[:2] - jnp.pi * arc.turns, unfolding[None]]),
         jnp.concatenate([start[2:], end[2:], unfolding[None]]),
         jnp.append(end + start - full_turns + unfolding * gradient, gradient[2]),
+        jnp.concatenate([_from_centre(start), end[:2] - jnp.pi * arc.turns, unfolding[None]]),
+        jnp.append(end - start - full_turns + unfolding * gradient, power),
     ])  # fmt: skip
-    odd = jnp.column_stack([jnp.eye(4) + unfolding * curvature, jnp.eye(4), gradient])
-    odd = jnp.concatenate([odd, jnp.append(curvature[2], jnp.zeros(5))[None]])
-    derivative = jnp.stack([jnp.asarray(_AT_REST["centred"]), jnp.asarray(_AT_REST["brake"]), odd])
-    return value[arc.symmetry], derivative[arc.symmetry]
+    derivative = {
+        **{name: jnp.asarray(rows) for name, rows in _LINEAR.items()},
+        "odd": unfolded(1.0, curvature[2]),
+        "none": unfolded(-1.0, change[0]),
+    }
+    return value[arc.symmetry], jnp.stack([derivative[name] for name in SYMMETRIES])[arc.symmetry]
+
+
+def _from_centre(start: Array) -> Array:
+    """theta from the nearest place of {0, pi}^2 up to full turns: a passing orbit's start stays
+    there all along its family, so that the nearest is known.
+    """
+    return start[:2] - jnp.pi * jnp.round(start[:2] / jnp.pi)
 
 
 def _rows(*columns: int) -> np.ndarray:
     return np.eye(9)[list(columns)]
 
 
-# The derivatives of the conditions of orbits released from rest: of p(0), of theta or p at the end,
+# The derivatives of the conditions that are linear: of p(0) or theta(0), of theta or p at the end,
 # of the unfolding.
-_AT_REST = {"centred": _rows(2, 3, 4, 5, 8), "brake": _rows(2, 3, 6, 7, 8)}
+_LINEAR = {
+    "centred": _rows(2, 3, 4, 5, 8),
+    "brake": _rows(2, 3, 6, 7, 8),
+    "passing": _rows(0, 1, 4, 5, 8),
+}
 
 # L and U in one matrix, and the order of the rows: what `lax.linalg.lu` has found already, and
 # `lu_solve` finds anew.

@@ -46,7 +46,7 @@ from dpend.mechanics.pendulum import (
     released,
 )
 from dpend.mechanics.units import natural
-from dpend.orbits.arc import PARTS
+from dpend.orbits.arc import PARTS, RELEASED_SYMMETRIES
 from dpend.orbits.implicit import (
     ArcGiven,
     Known,
@@ -59,7 +59,6 @@ from dpend.orbits.implicit import (
 )
 from dpend.orbits.orbit import (
     BRANCHES,
-    RELEASED_SYMMETRIES,
     Outcome,
     PeriodicOrbit,
     mirrored,
@@ -175,10 +174,10 @@ def _near_guess(
 
 def _know_newton(pendulum: Pendulum, line: Line, newton: LineNewton, symmetry: str) -> Array:
     """The columns of `Known` where Newton's method ended, from its own last integration."""
-    start, end = released(*(line.base + newton.x * line.direction)), newton.shot.end
+    start = released(*(line.base + newton.x * line.direction))
     kappas = stability_of(newton.shot.matrix[None], symmetry, jnp)[1:]
-    at_end = [end.theta1, end.theta2, jnp.exp(newton.log_time), hamiltonian(pendulum, start)]
-    return jnp.stack([*jax.tree.leaves(start), *at_end, *kappas])
+    states = [*jax.tree.leaves(start), *jax.tree.leaves(newton.shot.end)]
+    return jnp.stack([*states, jnp.exp(newton.log_time), hamiltonian(pendulum, start), *kappas])
 
 
 def _swing(angles: Array) -> Scalar:

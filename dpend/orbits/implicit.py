@@ -20,6 +20,7 @@ from dpend.motion.integrate import advance_state, step_size
 from dpend.orbits.arc import (
     LOG_DELTA,
     METHOD,
+    RELEASED_SYMMETRIES,
     SEGMENTS,
     UNFOLDING,
     arc_of,
@@ -44,6 +45,8 @@ class Known(NamedTuple):
     p2: Any
     end1: Any  # the angles at the arc's end
     end2: Any
+    end_p1: Any  # and the momenta
+    end_p2: Any
     time: Any  # of the arc
     energy: Any
     kappa: Any
@@ -142,8 +145,8 @@ def _know_arc(symmetry: str, point: Array, parameters: Array, given: ArcGiven) -
     end, matrices = transition(here, nodes, step_size(times, steps), steps, METHOD)
     stability = stability_of(jnp.moveaxis(matrices, -1, 0), symmetry, jnp)[1:]
     energy = hamiltonian(here, State(*point[:4]))
-    rest = [end.theta1[-1], end.theta2[-1], jnp.sum(times), energy, *stability]
-    return jnp.concatenate([point[:4], jnp.stack(rest)])
+    rest = jnp.stack([jnp.sum(times), energy, *stability])
+    return jnp.concatenate([point[:4], stack_state(end)[:, -1], rest])
 
 
 def arc_equations(symmetry: str) -> Equations:
@@ -152,14 +155,15 @@ def arc_equations(symmetry: str) -> Equations:
 
 
 def know_solved(rows: Solved, symmetry: str, xp: Any) -> Any:
-    """The columns of `Known` for points on a family, shape (..., 10), in NumPy or JAX.
+    """The columns of `Known` for points on a family, shape (..., 12), in NumPy or JAX.
 
-    But for `odd` orbits the start is at rest, exactly.
+    Orbits released from rest are at rest there exactly.
     """
     _, kappa, logarithm = stability_of(rows.matrices, symmetry, xp)
-    start = rows.point[..., :4] * xp.asarray([1.0, 1.0, *(2 * [float(symmetry == "odd")])])
+    moves = float(symmetry not in RELEASED_SYMMETRIES)
+    start = rows.point[..., :4] * xp.asarray([1.0, 1.0, moves, moves])
     rest = [rows.times.sum(axis=-1), rows.energy, kappa, logarithm]
-    return xp.concatenate([start, rows.end[..., :2], xp.stack(rest, axis=-1)], axis=-1)
+    return xp.concatenate([start, rows.end, xp.stack(rest, axis=-1)], axis=-1)
 
 
 class PieceGiven(NamedTuple):
@@ -195,8 +199,8 @@ def know_piece(symmetry: str, root: Array, parameters: Array, given: PieceGiven)
     start = released(*(parameters[2] * given.origin + root[0] * given.direction))
     end, matrix = transition(here, start, step_size(time, steps), steps, RK8)
     stability = stability_of(matrix[None], symmetry, jnp)[1:]
-    at_end = [end.theta1, end.theta2, time, hamiltonian(here, start), *stability]
-    return jnp.stack([*jax.tree.leaves(start), *at_end])
+    rest = [time, hamiltonian(here, start), *stability]
+    return jnp.stack([*jax.tree.leaves(start), *jax.tree.leaves(end), *rest])
 
 
 def piece_equations(symmetry: str) -> Equations:

@@ -28,22 +28,24 @@ from dpend.orbits.implicit import (
 )
 from dpend.orbits.newton import Solved
 from dpend.orbits.single import FINE, Line, clock, rate_along, steps_for
-from dpend.orbits.stability import stability_class
+from dpend.orbits.stability import OPPOSITE, stability_class
 from dpend.status import Status
 
 _EPS = float(np.finfo(np.float64).eps)
 BRANCHES = ("in-phase", "anti-phase")
-RELEASED_SYMMETRIES = ("centred", "brake")
+# The families of the normal modes, and of the equilibria with one rod upright.
+FAMILIES = (*BRANCHES, "down-up", "up-down")
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PeriodicOrbit:
-    """A periodic orbit, released from rest unless it is `odd`, or many of one shape.
+    """A periodic orbit, or many of one shape.
 
     Attributes:
         pendulum: its pendulum.
-        state: at t = 0, at rest; of an odd orbit where theta1 is at an extreme.
+        state: at t = 0: at rest if centred or brake, where theta1 is at an extreme if odd, in {0,
+            pi}^2 if passing, where the potential energy is at an extreme if without symmetry.
         period: the minimal one [s].
         energy: H [J], zero for both bobs at rest at the pivot's height.
         residual: the largest of the equations solved. From a guess: angles at T/4 [rad] if centred,
@@ -53,15 +55,18 @@ class PeriodicOrbit:
             linear solve; on a branch those of the walk's last step and those at the wanted release.
         kappa: half the sum of the two non-trivial Floquet multipliers.
         log_abs_kappa: log |kappa|, natural.
-        dual: the state at T/2, the other rest of the orbit.
-        turns: theta(T/4)/pi of a centred orbit, two integers; zeros otherwise.
+        dual: the state at T/2, the other rest of the orbit if it has one.
+        turns: theta(T/4)/pi of a centred orbit, two integers; the full turns of both rods in a
+            period of one that is passing or without symmetry; zeros otherwise.
         error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s], theta1 taken as
             it is: the change on solving again at half the step, and what the rounding of the motion
-            makes of them; NaN if that was not asked for.
+            makes of them; NaN if that was not asked for. Of a passing orbit the energy is taken as
+            it is, and the first is of the direction in which it starts, the angle phi of p = L (cos
+            phi, sin phi) sqrt(2 K), L L^T being the inertia and K the kinetic energy.
         status: a value of `Status`.
         symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from
-            rest), or `odd` (x(T/2) = -x(0) up to full turns, never at rest; found by
-            `follow_family`).
+            rest), `odd` (x(T/2) = -x(0) up to full turns, never at rest), `passing` (theta in {0,
+            pi}^2 at 0 and T/2, never at rest) or `none`.
     """
 
     pendulum: Pendulum
@@ -139,10 +144,16 @@ def orbit_in_units(
     second = xp.sqrt(pendulum.l1 / pendulum.g)
     momentum = pendulum.m1 * pendulum.l1**2 / second
     state = State(known.theta1, known.theta2, momentum * known.p1, momentum * known.p2)
-    end1, end2 = known.end1, known.end2
-    if symmetry != "brake":
-        end1, end2 = 2 * np.pi * turns[0] - state.theta1, 2 * np.pi * turns[1] - state.theta2
-    whole = turns if symmetry == "centred" else 0 * turns
+    dual = State(known.end1, known.end2, 0.0 - state.p1, 0.0 - state.p2)
+    whole = 0 * turns
+    if symmetry in OPPOSITE:
+        angles = 2 * np.pi * turns[0] - state.theta1, 2 * np.pi * turns[1] - state.theta2
+        dual = replace(dual, theta1=angles[0], theta2=angles[1])
+    if symmetry == "centred":
+        whole = turns
+    elif symmetry == "passing":
+        dual = replace(dual, p1=momentum * known.end_p1, p2=momentum * known.end_p2)
+        whole = [n - xp.round(x / np.pi) for n, x in zip(turns, (state.theta1, state.theta2), strict=True)]
     one = xp.ones_like(known.time)
     period = PARTS[symmetry] * second * known.time
     return PeriodicOrbit(
@@ -154,7 +165,7 @@ def orbit_in_units(
         iterations=outcome.iterations,
         kappa=known.kappa,
         log_abs_kappa=known.log_abs_kappa,
-        dual=State(end1, end2, 0.0 - state.p1, 0.0 - state.p2),
+        dual=dual,
         turns=((whole[0] * one).astype(int), (whole[1] * one).astype(int)),
         error_estimate=(outcome.angle_error, outcome.time_error * _constant(period)),
         status=outcome.status,

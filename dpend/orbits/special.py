@@ -3,6 +3,7 @@ off.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -59,17 +60,14 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
     """
     symmetry = track.problem.symmetry
     measure = measure_of(samples.rows, symmetry)
-    ranged = [
-        test
-        for test in test_functions(symmetry)
-        if test.kind.startswith(("above", "below", "resonance"))
-    ]
+    tests = test_functions(symmetry)
+    ranged = [test for test in tests if test.kind.startswith(("above", "below", "resonance"))]
     levels = np.arcsinh([-float(test.value(samples.rows, 0 * measure)[0]) for test in ranged])
     triples = []
+    folds = [test for test in tests if test.kind.startswith("fold")]
     for function, targets in (
         (lambda rows: np.arcsinh(measure_of(rows, symmetry)), levels),
-        (lambda rows: rows.tangent[:, 0], np.zeros(1)),
-        (lambda rows: rows.energy_slope, np.zeros(1)),
+        *((partial(fold.value, c=None), np.zeros(1)) for fold in folds),
     ):
         h = function(samples.rows)
         before, here, after = h[:-2], h[1:-1], h[2:]
