@@ -1,10 +1,10 @@
 """Multiple shooting: a symmetric orbit in segments, and the step from one orbit of a family to the
 next.
 
-A quarter (centred), half (brake, odd, passing) or the whole (none) of the period is cut into segments
-that are integrated side by side, each from its own initial state, the node; Newton's method makes their ends meet. No
-segment is long enough for the motion to forget where it began, so that orbits can be followed to
-where kappa is 1e40 and shooting in one piece would see noise.
+A quarter (centred), a half (brake, odd, passing) or the whole of the period (none) is cut into
+segments that are integrated side by side, each from its own initial state, the node; Newton's
+method makes their ends meet. No segment is long enough for the motion to forget where it began, so
+that orbits can be followed to where kappa is 1e40 and shooting in one piece would see noise.
 
 The duration of a segment is Delta/rate(node): every segment is given the same share Delta of the
 fastest motion, and that makes the mesh follow the orbit smoothly, without ever being laid anew.

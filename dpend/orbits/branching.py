@@ -51,7 +51,9 @@ def repeat_arc(problem: FamilyProblem, rows: Solved, halves: int) -> tuple[np.nd
     return np.concatenate(all_times), np.concatenate(all_states)
 
 
-def branches_at(base: Place, symmetry: str, k: int) -> Iterator[tuple[FamilyProblem, np.ndarray, np.ndarray]]:
+def branches_at(
+    base: Place, symmetry: str, k: int
+) -> Iterator[tuple[FamilyProblem, np.ndarray, np.ndarray]]:
     """The problems of the orbits of k times the period that branch off at a place, each with a
     point on the orbit there, and with how that point's first state moves along the base's family.
 

@@ -153,7 +153,10 @@ def orbit_in_units(
         whole = turns
     elif symmetry == "passing":
         dual = replace(dual, p1=momentum * known.end_p1, p2=momentum * known.end_p2)
-        whole = [n - xp.round(x / np.pi) for n, x in zip(turns, (state.theta1, state.theta2), strict=True)]
+        whole = [
+            turns[0] - xp.round(state.theta1 / np.pi),
+            turns[1] - xp.round(state.theta2 / np.pi),
+        ]
     one = xp.ones_like(known.time)
     period = PARTS[symmetry] * second * known.time
     return PeriodicOrbit(

@@ -103,7 +103,7 @@ def start_at_saddle(pendulum: Pendulum, upper: Scalar) -> Walk:
 def _start_swinging(
     pendulum: Pendulum, centre: Any, frequency: Scalar, direction: tuple[Any, Any]
 ) -> Walk:
-    """A walk at an equilibrium, about to follow the linear motion theta = centre + direction cos."""
+    """A walk at an equilibrium, about to follow theta = centre + direction cos(frequency t)."""
     phase = 0.5 * jnp.pi / SEGMENTS * jnp.arange(SEGMENTS, dtype=jnp.float64)
     moving = momenta(pendulum, *centre, *(frequency * x for x in direction))  # at the bottom
     shape = [
