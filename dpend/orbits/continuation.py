@@ -60,24 +60,26 @@ def follow_family(
     Jacobian's determinant changes sign, which would be a jump to another curve. The family ends
     where the energy comes within 1e-8 of that of an equilibrium with a rod upright (in units of the
     weights' torques; the period then grows like its logarithm), where it is back at its beginning,
-    or at the hanging pendulum.
+    at an equilibrium, or where a hundred times these torques let the rods turn over freely.
 
     Arguments:
         pendulum: the derivatives of its leaves, if they carry any, reach what `Family.at` returns;
             `jit` around this does not work.
-        start: `in-phase` or `anti-phase`, the family of a normal mode; or an orbit, from which its
-            family is followed in both directions; or a special point, for the branch that leaves
-            there: at a loss or gain of stability of centred orbits with c = 1 the orbits with
-            x(T/2) = -x(0) that are no longer released from rest, with c = -1 those released from
-            rest that are no longer centred, at a resonance the brake orbits of k times the period.
+        start: `in-phase` or `anti-phase`, the family of a normal mode; `down-up` or `up-down`, that
+            of the saddle (0, pi) or (pi, 0), whose orbits swing about it and are unstable (the
+            Lyapunov orbits); or an orbit, from which its family is followed in both directions; or
+            a special point, for the branch that leaves there: at a loss or gain of stability of
+            centred orbits with c = 1 the orbits with x(T/2) = -x(0) that are no longer released
+            from rest, with c = -1 either those released from rest that are no longer centred or
+            those through the same place of {0, pi}^2 that never rest, at a resonance the brake (of
+            passing orbits the passing) orbits of k times the period.
         longest_step: in arclength; the default gives about a hundred points.
         longest_period: [s]; the family is followed to its first orbit of this period.
         most_points: on one side of the start.
     Raises:
         ValueError: an unknown name; g not positive; an orbit of another pendulum, or that has not
-            converged; a special point where nothing branches off, or only orbits (c = -1 in half of
-            the cases) that are centred no longer and never rest; longest_period below the period of
-            the first orbit.
+            converged; a special point where nothing branches off; longest_period below the period
+            of the first orbit.
         RuntimeError: float64 is switched off in JAX.
     See also: Doedel, Keller and Kernevez, Numerical analysis and control of bifurcation problems
     (1991); Peeters et

@@ -59,7 +59,8 @@ class Family:
             no step was short enough, `MAX_ITERATIONS` if it has more points than were allowed.
         ends: what its beginning and its end are: `normal mode` (of an equilibrium), `homoclinic`
             (the period grows without bound as the energy tends to that of an equilibrium with a rod
-            upright), `closed` (it comes back to its beginning), `branch point`, `longest period`
+            upright), `closed` (it comes back to its beginning), `branch point`, `fast rotation`
+            (the energy grows without bound), `longest period`
             (if one was given), `lost` or `unfinished` (see status).
     """
 

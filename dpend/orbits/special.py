@@ -2,8 +2,7 @@
 off.
 """
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -64,11 +63,13 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
     ranged = [test for test in tests if test.kind.startswith(("above", "below", "resonance"))]
     levels = np.arcsinh([-float(test.value(samples.rows, 0 * measure)[0]) for test in ranged])
     triples = []
-    folds = [test for test in tests if test.kind.startswith("fold")]
-    for function, targets in (
+    heights: list[tuple[Callable[[Solved], np.ndarray], np.ndarray]] = [
         (lambda rows: np.arcsinh(measure_of(rows, symmetry)), levels),
-        *((partial(fold.value, c=None), np.zeros(1)) for fold in folds),
-    ):
+        (lambda rows: rows.energy_slope, np.zeros(1)),
+    ]
+    if any(test.kind == "fold_theta1" for test in tests):
+        heights.insert(1, (lambda rows: rows.tangent[:, 0], np.zeros(1)))
+    for function, targets in heights:
         h = function(samples.rows)
         before, here, after = h[:-2], h[1:-1], h[2:]
         highest, lowest = (here >= before) & (here >= after), (here <= before) & (here <= after)
