@@ -574,7 +574,31 @@ DOORS = {
             ),
             "crossing": COUNT,
         },
-        "dpend.orbits.family._passages",
+        "dpend.orbits.family._points_at",
+    ),
+    "Family.at, an energy": Door(
+        FAMILY.at,
+        {"energy": -0.5},
+        {
+            "energy": kind(
+                [*NO_COLUMNS, [], math.nan, [0.5, math.inf]],
+                [*HALVES, -0.5, [0.1, 0.2], np.ones((2, 2))],
+            ),
+            "theta1": kind([0.5]),
+        },
+        "dpend.orbits.family._points_at",
+    ),
+    "Family.at, a period": Door(
+        FAMILY.at,
+        {"period": 1.0},
+        {
+            "period": kind(
+                [*NO_COLUMNS, [], math.nan, [0.5, math.inf], 0.0, -1],
+                [*HALVES, [0.9, 1.2], np.ones((2, 2))],
+            ),
+            "energy": kind([0.5]),
+        },
+        "dpend.orbits.family._points_at",
     ),
     "find_brake_orbits": Door(
         dpend.find_brake_orbits,
@@ -1042,6 +1066,8 @@ TRACEABLE = {
 DIFFERENTIABLE = TRACEABLE | {
     ("simulate", "duration"),
     ("Family.at", "theta1"),
+    ("Family.at, an energy", "energy"),
+    ("Family.at, a period", "period"),
     ("stability_class", "kappa"),
 }
 TRANSFORMATIONS = {

@@ -200,6 +200,10 @@ class FamilyProblem:
         upper, lower = float(1 + self.natural.m2), float(self.natural.m2 * self.natural.l2)
         return np.array([-upper - lower, lower - upper, upper - lower, upper + lower])
 
+    def level_near(self, energy: float) -> float:
+        """The energy of the equilibrium that is nearest in energy."""
+        return float(self.levels[np.argmin(np.abs(self.levels - energy))])
+
     def _end(self, rows: Solved) -> str:
         """What a family has ended at: an equilibrium's energy, where the time grows like the
         logarithm of the distance from it, or an equilibrium, or rotation without end.

@@ -7,7 +7,7 @@ m2/m1 and the value of what is held fixed at the release, in natural units.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -112,15 +112,24 @@ def parameters_of(pendulum: Pendulum, target: Scalar) -> Array:
 
 
 class ArcGiven(NamedTuple):
-    """Of a root of segments: row . point is held at the target; steps of a segment; turns."""
+    """Of a root of segments: what row . point is, if that is held; steps of a segment; turns."""
 
     row: Float[Array, " D"]
     steps: Scalar
     turns: Float[Array, "2"]
 
 
+def _held_value(held: str, pendulum: Pendulum, point: Array, row: Array) -> Scalar:
+    """What is held at the target: row . point, the energy, or the log of the arc's time."""
+    if held == "energy":
+        return hamiltonian(pendulum, State(*point[:4]))
+    if held == "period":
+        return jnp.log(jnp.sum(arc_times(pendulum, point)[0]))
+    return row @ point
+
+
 def _linearise_arc(
-    symmetry: str, point: Array, parameters: Array, given: ArcGiven
+    held: str, symmetry: str, point: Array, parameters: Array, given: ArcGiven
 ) -> tuple[Array, Array]:
     arc, steps = arc_of(symmetry, given.turns), given.steps.astype(int)
     jacobian = shooting_equations(_pendulum(parameters), point, steps, arc).jacobian
@@ -132,10 +141,11 @@ def _linearise_arc(
             advance_state(METHOD, here, State(*nodes.T), step_size(time, steps), steps)
         ).T
         conditions, _ = end_conditions(here, nodes[0], end[-1], point[UNFOLDING], arc)
-        border = given.row @ point - parameters[2]
+        border = _held_value(held, here, point, given.row) - parameters[2]
         return jnp.concatenate([(end[:-1] - nodes[1:]).ravel(), conditions, border[None]])
 
-    return jnp.concatenate([jacobian, given.row[None]]), jax.jacfwd(closings)(parameters)
+    border = jax.grad(_held_value, 2)(held, _pendulum(parameters), point, given.row)
+    return jnp.concatenate([jacobian, border[None]]), jax.jacfwd(closings)(parameters)
 
 
 def _know_arc(symmetry: str, point: Array, parameters: Array, given: ArcGiven) -> Array:
@@ -149,9 +159,10 @@ def _know_arc(symmetry: str, point: Array, parameters: Array, given: ArcGiven) -
     return jnp.concatenate([point[:4], stack_state(end)[:, -1], rest])
 
 
-def arc_equations(symmetry: str) -> Equations:
-    """The equations of an orbit in segments."""
-    return Equations(symmetry, _linearise_arc, _know_arc)
+@cache
+def arc_equations(symmetry: str, held: str = "theta1") -> Equations:
+    """The equations of an orbit in segments, `held` being `energy`, `period`, or a row . point."""
+    return Equations(symmetry, partial(_linearise_arc, held), _know_arc)
 
 
 def know_solved(rows: Solved, symmetry: str, xp: Any) -> Any:

@@ -224,35 +224,44 @@ class Slopes(NamedTuple):
     energy: Scalar
 
 
-@partial(jax.jit, static_argnames="symmetry")
+class Held(NamedTuple):
+    """What orbits were solved for, which everything else of them is a function of.
+
+    Attributes:
+        name: `theta1`, `energy` or `period`.
+        targets: its values in natural units (of the period the log of the arc's time), shape (n,).
+        rows: of theta1 the covectors, shape (n, D).
+    """
+
+    name: str
+    targets: Any
+    rows: Any
+
+
+@partial(jax.jit, static_argnames=("symmetry", "held"))
 def _carry(
-    pendulum: Pendulum, targets: Array, values: tuple, given: ArcGiven, symmetry: str
+    pendulum: Pendulum, targets: Array, values: tuple, given: ArcGiven, symmetry: str, held: str
 ) -> Array:
     """What is known, as a function of the pendulum and the targets."""
+    equations = arc_equations(symmetry, held)
 
     def one(values: tuple, parameters: Array, row: Array, steps: Array) -> Array:
         here = ArcGiven(row, steps, given.turns)
-        return jnp.asarray(implicit(arc_equations(symmetry), values, parameters, here)[1])
+        return jnp.asarray(implicit(equations, values, parameters, here)[1])
 
     return jax.vmap(one)(values, parameters_of(pendulum, targets), given.row, given.steps)
 
 
-def orbits_of(
-    problem: FamilyProblem, rows: Solved, targets: Any = None, along: Any = None
-) -> PeriodicOrbit:
-    """Points as orbits.
-
-    With `targets`, the values of theta1 at which the rows `along` were solved, everything carries
-    derivatives.
-    """
+def orbits_of(problem: FamilyProblem, rows: Solved, held: Held | None = None) -> PeriodicOrbit:
+    """Points as orbits; where it is told what was held, everything carries derivatives."""
     known, turns = know_solved(rows, problem.symmetry, np), np.asarray(problem.turns)
     status = np.where(rows.converged > 0, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
     outcome = outcome_of(rows, status, np)
-    if targets is None:
+    if held is None:
         pendulum = jax.tree.map(known_value, problem.pendulum)
         return orbit_in_units(pendulum, Known(*known.T), turns, problem.symmetry, outcome, np)
-    given = ArcGiven(along, rows.steps, jnp.asarray(turns))
-    known = _carry(problem.pendulum, targets, (rows.point, known), given, problem.symmetry)
+    given, values = ArcGiven(held.rows, rows.steps, jnp.asarray(turns)), (rows.point, known)
+    known = _carry(problem.pendulum, held.targets, values, given, problem.symmetry, held.name)
     return orbit_in_units(problem.pendulum, Known(*known.T), turns, problem.symmetry, outcome)
 
 

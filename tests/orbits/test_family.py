@@ -705,3 +705,33 @@ def test_families_of_the_saddles(unit, branch, centre, folds):
     np.testing.assert_allclose(family.orbits.energy[-1], 3.0, atol=1e-7)
     states = motion(single(family.orbits, 12))
     np.testing.assert_allclose(states[:2, 14], centre, atol=1e-9)
+
+
+def test_orbits_of_an_energy_or_a_period(families):
+    """The same orbits as by the release angle; derivatives are those of neighbours on the curve."""
+    family, angles = families["anti-phase"], np.array([0.3, 1.5, 2.7])
+    orbits = family.at(angles)
+    for name in ("energy", "period"):
+        again = family.at(**{name: getattr(orbits, name)})
+        np.testing.assert_array_equal(again.status, Status.CONVERGED)
+        np.testing.assert_allclose(again.theta1, angles, rtol=1e-11)
+        np.testing.assert_allclose(getattr(again, name), getattr(orbits, name), rtol=1e-14)
+    assert family.at(energy=3.1).status == family.at(period=3.0).status == Status.NO_SUCH_ORBIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "value"), [("energy", -1.5), ("period", 6.0)])
+def test_derivatives_of_orbits_of_an_energy_or_a_period(name, value):
+    """By central differences, whose own errors are some 1e-8 and 1e-6 here."""
+    other = "period" if name == "energy" else "energy"
+
+    def found(value, mass):
+        family = dpend.follow_family(Pendulum(1.0, 1.0, 1.0, mass, 1.0), "anti-phase")
+        return getattr(family.at(**{name: value}), other)
+
+    slopes, h = jax.grad(found, (0, 1))(value, 1.0), 1e-4
+    by_value = (found(value + h, 1.0) - found(value - h, 1.0)) / (2 * h)
+    by_mass = (found(value, 1.0 + h) - found(value, 1.0 - h)) / (2 * h)
+    np.testing.assert_allclose(slopes, [by_value, by_mass], rtol=1e-6)
+    second = (found(value + h, 1.0) - 2 * found(value, 1.0) + found(value - h, 1.0)) / h**2
+    np.testing.assert_allclose(jax.hessian(found)(value, 1.0), second, rtol=1e-4)
