@@ -25,7 +25,7 @@ chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.crossings orbits.special
-orbits.find orbits.passages orbits.family orbits.branching orbits.continuation
+orbits.passages orbits.through orbits.find orbits.family orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty

@@ -15,6 +15,7 @@ Everything here is in natural units, l1 = m1 = g = 1: a pendulum is then (l2/l1,
 scaling laws hold to the last digit.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -35,7 +36,7 @@ SEGMENTS = 16
 UNKNOWNS = 4 * SEGMENTS + 2
 # The conditions at the ends of the arc, by symmetry; the index is what compiled code is told.
 SYMMETRIES = ("centred", "brake", "odd", "passing", "none")
-PASSING = SYMMETRIES.index("passing")
+PASSING, NONE = SYMMETRIES.index("passing"), SYMMETRIES.index("none")
 RELEASED_SYMMETRIES = ("centred", "brake")
 # What part of the period the arc is.
 PARTS = {"centred": 4, "brake": 2, "odd": 2, "passing": 2, "none": 1}
@@ -230,6 +231,31 @@ def solve_transposed(factors: Factors, right: Array) -> Array:
     return jnp.zeros_like(right).at[order].set(whole)
 
 
+def _state_at(pendulum: Pendulum, times: Array, states: Array, time: Scalar) -> Array:
+    """The state of a motion at a time from the last one before it that is known."""
+    # As many steps as rates of four times the linear motion's need: an arc will be corrected.
+    rate = 4 * fast_frequency(pendulum) * jnp.sqrt(1 + pendulum.m2)
+    nearest = jnp.searchsorted(times, time, side="right") - 1
+    rest = time - times[nearest]
+    steps = jnp.clip(jnp.ceil(rest * rate / TURN), 1, 100 * MOST_SEGMENT_STEPS).astype(int)
+    return stack_state(
+        advance_state(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps)
+    )
+
+
+def state_halfway(pendulum: Pendulum, point: Array) -> Array:
+    """The state at half of the arc's time, from a point's nodes."""
+    times, _ = arc_times(pendulum, point)
+    starts = jnp.append(0.0, jnp.cumsum(times)[:-1])
+    return _state_at(pendulum, starts, point[:LOG_DELTA].reshape(SEGMENTS, 4), 0.5 * jnp.sum(times))
+
+
+@jax.jit
+def states_on_arc(pendulum: Pendulum, times: Array, states: Array, wanted: Array) -> Array:
+    """The states at wanted times, rows of four, of a motion of which some are known."""
+    return jax.vmap(partial(_state_at, pendulum, times, states))(wanted)
+
+
 @jax.jit
 def lay_arc(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -> Array:
     """Nodes and log Delta of an arc of `duration` on an orbit of which some states are known.
@@ -237,17 +263,9 @@ def lay_arc(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -
     Arguments:
         times, states: known ones in order of time, beginning with (0, x(0)).
     """
-    # As many as rates of four times the linear motion's need: what is laid will be corrected.
-    rate = 4 * fast_frequency(pendulum) * jnp.sqrt(1 + pendulum.m2)
 
     def state_at(time: Scalar) -> Array:
-        time = jnp.clip(time, 0.0, duration)
-        nearest = jnp.searchsorted(times, time, side="right") - 1
-        rest = time - times[nearest]
-        steps = jnp.clip(jnp.ceil(rest * rate / TURN), 1, 100 * MOST_SEGMENT_STEPS).astype(int)
-        return stack_state(
-            advance_state(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps)
-        )
+        return _state_at(pendulum, times, states, jnp.clip(time, 0.0, duration))
 
     def nodes(delta: Scalar) -> tuple[Scalar, Array]:
         def step(time: Scalar, _: None) -> tuple[Scalar, Array]:

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.checks import integer, known_number, known_real, known_value, single
-from dpend.mechanics.pendulum import Pendulum, check_pendulum
+from dpend.checks import integer, known_number, known_real, known_value
+from dpend.mechanics.pendulum import Pendulum
 from dpend.mechanics.units import natural
 from dpend.orbits.arc import PARTS
 from dpend.orbits.branching import branches_at
@@ -29,7 +29,7 @@ from dpend.orbits.curve import (
     way_to,
 )
 from dpend.orbits.family import Family, family_of
-from dpend.orbits.find import swinging_pendulum
+from dpend.orbits.find import swinging_numbers
 from dpend.orbits.follow import FamilyProblem, Reach, guess_arc, start_at
 from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.orbit import BRANCHES, FAMILIES, PeriodicOrbit
@@ -86,7 +86,7 @@ def follow_family(
         al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
     """
     require_float64()
-    fixed = _primal(pendulum)
+    fixed = swinging_numbers(pendulum)
     if not isinstance(start, (str, PeriodicOrbit, SpecialPoint)):
         raise ValueError(
             f"start must be one of {', '.join(FAMILIES)}, an orbit or a special point, got "
@@ -112,22 +112,6 @@ def follow_family(
     if isinstance(start, SpecialPoint):
         return _from_branch_point(pendulum, start, reach)
     return _from_orbit(pendulum, scaled, start, reach)
-
-
-def _primal(pendulum: Any) -> Pendulum:
-    """The numbers behind a pendulum, also under eager differentiation, whose derivatives
-    `Family.at` carries on.
-
-    Raises:
-        ValueError: no pendulum; a field that is an array or traced by `jit`; g not positive.
-    """
-    check_pendulum(pendulum)
-    numbers = {}
-    for name, leaf in vars(pendulum).items():
-        single(name, leaf)
-        known = known_value(leaf)
-        numbers[name] = leaf if known is None else known
-    return swinging_pendulum(Pendulum(**numbers))  # which refuses what `jit` traces
 
 
 _at_mode, _at_saddle = jax.jit(start_at_mode), jax.jit(start_at_saddle)
@@ -162,7 +146,7 @@ def _too_short(reach: Reach) -> ValueError:
 
 
 def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reach: Reach) -> Family:
-    fixed = _primal(pendulum)
+    fixed = swinging_numbers(pendulum)
     orbit = _known_orbit(fixed, orbit)
     second = math.sqrt(fixed.l1 / fixed.g)
     momentum = fixed.m1 * fixed.l1**2 / second

@@ -168,7 +168,9 @@ def _points_at(family: Family, name: str, values: np.ndarray, crossing: int) -> 
         rows[:, 0] = 1.0
         solved = problem.correct(points, rows, curve.steps[start + 1])
     else:
-        solved = onto_level(problem, name, targets, curve, (start, share))
+        rows = METRIC * curve.tangents_between(start, share)
+        near = problem.correct(points, rows, curve.steps[start + 1])
+        solved, _ = onto_level(problem, name, targets, near, curve.lengths[start])
     away = np.sqrt(np.sum(METRIC * (solved.point - points) ** 2, axis=1))
     strayed = away > np.maximum(STRAYED * curve.lengths[start], 1e-9)
     return _Found(solved, index >= 0, strayed, side, rows)

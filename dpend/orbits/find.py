@@ -40,6 +40,7 @@ from dpend.checks import (
 )
 from dpend.mechanics.pendulum import (
     Pendulum,
+    State,
     check_pendulum,
     hamiltonian,
     known_pendulum,
@@ -81,6 +82,7 @@ from dpend.orbits.single import (
     steps_for,
 )
 from dpend.orbits.stability import stability_of
+from dpend.orbits.through import orbit_through, request_of
 from dpend.status import Status
 
 # How near to an equilibrium a search may end, in units of the swing.
@@ -189,11 +191,15 @@ def _swing(angles: Array) -> Scalar:
 
 def find_orbit(
     pendulum: Pendulum | Any,
-    theta1: Scalar,
+    theta1: Scalar | None = None,
     *,
     branch: str | Any | None = None,
     guess: tuple[Scalar, Scalar] | Any | None = None,
+    state: State | Any | None = None,
+    period: Scalar | Any | None = None,
     symmetry: str | Any | None = None,
+    turns: tuple[int, int] | Any | None = None,
+    keep: str | Any = "energy",
     ratio: int | Any | None = None,
     crossing: int | Any = 1,
     turn: float | Any = FINE,
@@ -201,7 +207,8 @@ def find_orbit(
     max_iterations: int | Any = 40,
     error: bool | Any = True,
 ) -> PeriodicOrbit:
-    """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period.
+    """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period;
+    or the periodic orbit near the motion from any `state`.
 
     Solves theta(T/4) = 0 modulo pi (centred) or p(T/2) = 0 (brake) for (theta2, T) by damped Newton
     iterations whose Jacobian is forward-mode through the flow. Give one of:
@@ -217,6 +224,12 @@ def find_orbit(
       (-1) branch, or on `branch`, the one nearest to `theta1`, which is then an unknown too; with
       `guess`, the one near it.
 
+    - `state` and `period`, without theta1: start from this motion over that time and take what
+      Newton's method finds, in segments (see `arc`), with the energy of the state (or, if told to
+      keep that, the period), reduced to its minimal period. Without a symmetry the closed motion
+      x(T) = x(0) is solved for, unfolded by one parameter, and solved again with the symmetry that
+      it turns out to have.
+
     Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
     and the pendulum are those of the root itself (implicit function theorem), second ones as
     `jax.hessian` takes them; with `jit`, `vmap` and `grad` all works, and what is wrong with a
@@ -226,9 +239,15 @@ def find_orbit(
         theta1: release angle of the upper rod [rad].
         branch: `in-phase` (slow mode) or `anti-phase` (fast mode).
         guess: theta2 [rad], period [s].
+        state: a state on the orbit or near it, anywhere.
+        period: [s], with `state`.
         symmetry: with `guess`, `centred` or `brake`. Without it the guess is solved as brake and
             solved again as centred if the orbit is that; under tracing it stays brake, of which
-            every centred orbit is a case.
+            every centred orbit is a case. With `state` also `passing`, `odd` or `none`: see
+            `PeriodicOrbit`.
+        turns: with `state`, the full turns of both rods in a period, of an orbit that is passing or
+            has no symmetry; those of the motion if not given.
+        keep: with `state`, what the orbit has in common with its motion: `energy` or `period`.
         ratio: +1 or -1.
         crossing: which of the branch's passages through `theta1`, in order of arclength.
         turn: how far the fastest motion may advance in one integration step [rad]; 0.1 leaves
@@ -253,6 +272,9 @@ def find_orbit(
         period.
     """
     require_float64()
+    if state is not None or period is not None:
+        others = {"theta1": theta1, "branch": branch, "guess": guess, "ratio": ratio}
+        return _through_state(pendulum, state, period, (symmetry, turns, keep), others)
     theta1, crossing = number("theta1", theta1, unit="rad"), integer("crossing", crossing)
     _check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
     values = {
@@ -287,6 +309,16 @@ def find_orbit(
     if not _is_same(centred, orbit):
         return orbit
     return replace(centred, iterations=orbit.iterations + centred.iterations)
+
+
+def _through_state(
+    pendulum: Any, state: Any, period: Any, options: tuple[Any, Any, Any], others: dict[str, Any]
+) -> PeriodicOrbit:
+    """The orbit near a motion, once what is asked has been looked at."""
+    mine = {"period": period} if state is None else {"state": state}
+    for name, value in others.items():
+        at_most_one(**{name: value}, **mine)
+    return orbit_through(pendulum, swinging_numbers(pendulum), request_of(state, period, *options))
 
 
 def _check_request(
@@ -379,6 +411,22 @@ def swinging_pendulum(pendulum: Any) -> Pendulum:
             f"g must be positive for orbits, got {fixed.g:g}: nothing swings back without gravity"
         )
     return fixed
+
+
+def swinging_numbers(pendulum: Any) -> Pendulum:
+    """The numbers behind a pendulum, also under eager differentiation, whose derivatives orbits
+    carry on.
+
+    Raises:
+        ValueError: no pendulum; a field that is an array or traced by `jit`; g not positive.
+    """
+    check_pendulum(pendulum)
+    numbers = {}
+    for name, leaf in vars(pendulum).items():
+        single(name, leaf)
+        known = known_value(leaf)
+        numbers[name] = leaf if known is None else known
+    return swinging_pendulum(Pendulum(**numbers))  # which refuses what `jit` traces
 
 
 def _multiple_of_pi(angle: float) -> bool:

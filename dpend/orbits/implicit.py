@@ -28,6 +28,7 @@ from dpend.orbits.arc import (
     end_conditions,
     shooting_equations,
     stack_state,
+    state_halfway,
 )
 from dpend.orbits.newton import Solved
 from dpend.orbits.single import RK8
@@ -43,7 +44,7 @@ class Known(NamedTuple):
     theta2: Any
     p1: Any
     p2: Any
-    end1: Any  # the angles at the arc's end
+    end1: Any  # the angles at the arc's end, without symmetry at half of it
     end2: Any
     end_p1: Any  # and the momenta
     end_p2: Any
@@ -156,7 +157,8 @@ def _know_arc(symmetry: str, point: Array, parameters: Array, given: ArcGiven) -
     stability = stability_of(jnp.moveaxis(matrices, -1, 0), symmetry, jnp)[1:]
     energy = hamiltonian(here, State(*point[:4]))
     rest = jnp.stack([jnp.sum(times), energy, *stability])
-    return jnp.concatenate([point[:4], stack_state(end)[:, -1], rest])
+    last = stack_state(end)[:, -1] if symmetry != "none" else state_halfway(here, point)
+    return jnp.concatenate([point[:4], last, rest])
 
 
 @cache

@@ -19,6 +19,7 @@ from dpend.mechanics.pendulum import Pendulum, State, hamiltonian, vector_field
 from dpend.orbits.arc import (
     LOG_DELTA,
     MOST_SEGMENT_STEPS,
+    NONE,
     PASSING,
     SEGMENTS,
     TURN,
@@ -87,9 +88,9 @@ class Solved(NamedTuple):
         release_change: the change of the release on solving at half the step [rad], of a passing
             orbit that of the first rates.
         angle_error, time_error: of theta2 [rad] and of the time, relative, at this theta1 (or of
-            what else the aim asks; of a passing orbit, of the direction phi at this energy, see
-            `_of_passing`): the change on solving at half the step, and what rounding on the way
-            makes of them.
+            what else the aim asks; without symmetry, at this energy; of a passing orbit the first
+            is of the direction phi, see `_of_moving`): the change on solving at half the step, and
+            what rounding on the way makes of them.
         iterations: of Newton's method.
         residual: of the equations, the largest.
         end: the state at the arc's end.
@@ -176,9 +177,11 @@ def _errors(
     carry to what is asked. Where `fixed` is off, the curve's slope tells what the others are off
     by; at a fold, where that is infinite, its curvature does.
     """
-    passing = _of_passing(pendulum, n.point)
-    asked = jnp.stack([jnp.asarray(aim.fixed), jnp.asarray(aim.asked)])
-    wanted = jnp.append(jnp.where(arc.symmetry == PASSING, passing, asked), time[None], axis=0)
+    energy, direction = _of_moving(pendulum, n.point)
+    passing = arc.symmetry == PASSING
+    fixed = jnp.where(passing | (arc.symmetry == NONE), energy, jnp.asarray(aim.fixed))
+    asked = jnp.where(passing, direction, jnp.asarray(aim.asked))
+    wanted = jnp.stack([fixed, asked, time])
     pulled = solve_transposed(n.factors, wanted.T).T * _rounding(pendulum, n.point, arc)
     off, moving = jnp.sqrt(jnp.sum(pulled[0] ** 2)), wanted[0] @ tangent
     slope = jnp.maximum(jnp.maximum(jnp.abs(moving), jnp.sqrt(off)), jnp.finfo(float).tiny)
@@ -187,18 +190,19 @@ def _errors(
     return jnp.abs(change) + jnp.sqrt(jnp.sum((pulled[1:] - along * pulled[:1]) ** 2, axis=1))
 
 
-def _of_passing(pendulum: Pendulum, point: Array) -> Array:
-    """The covectors of the energy and of the direction at a start in {0, pi}^2, shape (2, D).
+def _of_moving(pendulum: Pendulum, point: Array) -> Array:
+    """The covectors of the energy, and of the direction at a start in {0, pi}^2, shape (2, D).
 
     There the momenta of one energy are an ellipse, p = sqrt(2 K) L (cos phi, sin phi) with L L^T
     the inertia and K the kinetic energy; d phi = (p1 dp2 - p2 dp1)/(2 K det L), and dH = theta' dp.
     """
-    rates = stack_state(vector_field(pendulum, State(*point[:4])))[:2]
-    p1, p2 = point[2:4]
+    slope = stack_state(vector_field(pendulum, State(*point[:4])))
+    rates, (p1, p2) = slope[:2], point[2:4]
     # det L = sqrt(m1 m2) l1 l2 where the rods are in line.
     area = (p1 * rates[0] + p2 * rates[1]) * pendulum.l2 * jnp.sqrt(pendulum.m2)
-    both = jnp.stack([rates, jnp.stack([-p2, p1]) / area])
-    return jnp.pad(both, ((0, 0), (2, UNKNOWNS - 4)))
+    direction = jnp.concatenate([jnp.zeros(2), jnp.stack([-p2, p1]) / area])
+    both = jnp.stack([jnp.concatenate([-slope[2:], rates]), direction])
+    return jnp.pad(both, ((0, 0), (0, UNKNOWNS - 4)))
 
 
 def _inertia(pendulum: Pendulum) -> Array:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from dpend.checks import Scalar, known_value
 from dpend.mechanics.pendulum import Pendulum, State
 from dpend.mechanics.units import natural
-from dpend.orbits.arc import PARTS
+from dpend.orbits.arc import PARTS, state_halfway
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.implicit import (
     ArcGiven,
@@ -60,8 +60,9 @@ class PeriodicOrbit:
             period of one that is passing or without symmetry; zeros otherwise.
         error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s], theta1 taken as
             it is: the change on solving again at half the step, and what the rounding of the motion
-            makes of them; NaN if that was not asked for. Of a passing orbit the energy is taken as
-            it is, and the first is of the direction in which it starts, the angle phi of p = L (cos
+            makes of them; NaN if that was not asked for. Without symmetry, and of a passing orbit,
+            the energy is taken as it is instead; of a passing orbit the first is of the direction
+            in which it starts, the angle phi of p = L (cos
             phi, sin phi) sqrt(2 K), L L^T being the inertia and K the kinetic energy.
         status: a value of `Status`.
         symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from
@@ -145,18 +146,15 @@ def orbit_in_units(
     momentum = pendulum.m1 * pendulum.l1**2 / second
     state = State(known.theta1, known.theta2, momentum * known.p1, momentum * known.p2)
     dual = State(known.end1, known.end2, 0.0 - state.p1, 0.0 - state.p2)
-    whole = 0 * turns
     if symmetry in OPPOSITE:
         angles = 2 * np.pi * turns[0] - state.theta1, 2 * np.pi * turns[1] - state.theta2
         dual = replace(dual, theta1=angles[0], theta2=angles[1])
-    if symmetry == "centred":
-        whole = turns
-    elif symmetry == "passing":
+    elif symmetry != "brake":
         dual = replace(dual, p1=momentum * known.end_p1, p2=momentum * known.end_p2)
-        whole = [
-            turns[0] - xp.round(state.theta1 / np.pi),
-            turns[1] - xp.round(state.theta2 / np.pi),
-        ]
+    whole = turns if symmetry in ("centred", "none") else 0 * turns
+    if symmetry == "passing":
+        centre = (xp.round(angle / np.pi) for angle in (state.theta1, state.theta2))
+        whole = [turn - start for turn, start in zip(turns, centre, strict=True)]
     one = xp.ones_like(known.time)
     period = PARTS[symmetry] * second * known.time
     return PeriodicOrbit(
@@ -179,6 +177,9 @@ def orbit_in_units(
 def _constant(value: Any) -> Any:
     """The value without its derivatives."""
     return value if isinstance(value, np.ndarray) else lax.stop_gradient(value)
+
+
+_halfway = jax.jit(state_halfway)
 
 
 @jax.jit
@@ -257,6 +258,8 @@ def orbits_of(problem: FamilyProblem, rows: Solved, held: Held | None = None) ->
     known, turns = know_solved(rows, problem.symmetry, np), np.asarray(problem.turns)
     status = np.where(rows.converged > 0, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
     outcome = outcome_of(rows, status, np)
+    if problem.symmetry == "none":
+        known[:, 4:8] = [_halfway(problem.natural, point) for point in rows.point]
     if held is None:
         pendulum = jax.tree.map(known_value, problem.pendulum)
         return orbit_in_units(pendulum, Known(*known.T), turns, problem.symmetry, outcome, np)

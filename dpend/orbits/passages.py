@@ -23,8 +23,9 @@ _PIECES = 8
 _HALVINGS = 50
 # Rounds of Newton's method along the curve for a level: its square is below rounding after three.
 _ROUNDS = 6
-# A step along the curve below this [arclength] need not be made.
-_ARRIVED = 1e-13
+# A step along the curve below this [arclength] need not be made. Rounding leaves less than the
+# second of an energy or the log of a period.
+_ARRIVED, _MISSED = 1e-13, 1e-9
 
 
 class Level(NamedTuple):
@@ -134,20 +135,22 @@ def _passages(
 
 
 def onto_level(
-    problem: FamilyProblem, name: str, targets: np.ndarray, curve: Curve, place: tuple
-) -> Solved:
-    """The points of the family with the wanted energies or periods near places (interval, share) of
-    its curve, by Newton's method along it.
+    problem: FamilyProblem, name: str, targets: np.ndarray, rows: Solved, room: np.ndarray
+) -> tuple[Solved, np.ndarray]:
+    """The points of a family with the wanted energies or periods, by Newton's method along it from
+    points close by, and whether they are met.
+
+    Arguments:
+        room: the longest step in arclength.
     """
-    level, (index, share) = LEVELS[name], place
-    points, tangents = curve.between(index, share), curve.tangents_between(index, share)
-    steps, room = curve.steps[index + 1], curve.lengths[index]
+    level = LEVELS[name]
     for _ in range(_ROUNDS):
-        rows = problem.correct(points, METRIC * tangents, steps)
         with np.errstate(divide="ignore", invalid="ignore"):
             way = (targets - level.value(rows)) / level.slope(rows)
         way = np.clip(np.nan_to_num(way), -room, room)
         if np.all(np.abs(way) < _ARRIVED):
             break
-        points, tangents, steps = rows.point + way[:, None] * rows.tangent, rows.tangent, rows.steps
-    return rows
+        points = rows.point + way[:, None] * rows.tangent
+        rows = problem.correct(points, METRIC * rows.tangent, rows.steps)
+    missed = np.abs(targets - level.value(rows)) > _MISSED * (1 + np.abs(targets))
+    return rows, (rows.converged > 0) & ~missed
