@@ -50,8 +50,8 @@ class Family:
         ends: what its beginning and its end are: `normal mode` (of an equilibrium), `homoclinic`
             (the period grows without bound as the energy tends to that of an equilibrium with a rod
             upright), `closed` (it comes back to its beginning), `branch point`, `fast rotation`
-            (the energy grows without bound), `longest period`
-            (if one was given), `lost` or `unfinished` (see status).
+            (the energy grows without bound), `longest period` (if one was given), `lost` or
+            `unfinished` (see status).
     """
 
     orbits: PeriodicOrbit
@@ -83,7 +83,7 @@ class Family:
         crossing: int | Any = 1,
     ) -> PeriodicOrbit:
         """The orbits of this family released at `theta1`, or with this energy or period: Newton's
-        method from where its curve passes.
+        method from where its curve passes. Give one of the three.
 
         An orbit released at (-theta1, -theta2) counts; where the curve has it, the mirror image is
         returned. Derivatives with respect to what is given, and to the pendulum that
@@ -200,12 +200,11 @@ def _known_values(name: str, value: Any) -> tuple[jax.Array, np.ndarray]:
 
 def _refuse_folds(family: Family, name: str, found: _Found, wanted: np.ndarray) -> None:
     """Refuses a derivative with respect to what is infinite at a fold."""
-    folds = np.array(
-        [abs(float(p.orbit.theta1)) for p in family.special_points if p.kind == f"fold_{name}"]
-    )
-    near = np.any(np.abs(np.abs(wanted)[:, None] - folds) < _AT_FOLD**2, axis=1)
-    near &= name == "theta1"
-    folded = near | (found.there & (np.abs(LEVELS[name].slope(found.solved)) < _AT_FOLD))
+    folded = found.there & (np.abs(LEVELS[name].slope(found.solved)) < _AT_FOLD)
+    if name == "theta1":
+        points = family.special_points
+        folds = np.array([abs(float(p.orbit.theta1)) for p in points if p.kind == "fold_theta1"])
+        folded |= np.any(np.abs(np.abs(wanted)[:, None] - folds) < _AT_FOLD**2, axis=1)
     if np.any(folded):
         raise ValueError(
             f"{name} must not be a fold of the family for a derivative, got "

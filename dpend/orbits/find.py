@@ -36,6 +36,7 @@ from dpend.checks import (
     number,
     one_of,
     several,
+    shown,
     single,
 )
 from dpend.mechanics.pendulum import (
@@ -223,12 +224,11 @@ def find_orbit(
     - `ratio` alone: of the orbits with theta2 = ratio theta1 on the in-phase (+1) or anti-phase
       (-1) branch, or on `branch`, the one nearest to `theta1`, which is then an unknown too; with
       `guess`, the one near it.
-
     - `state` and `period`, without theta1: start from this motion over that time and take what
-      Newton's method finds, in segments (see `arc`), with the energy of the state (or, if told to
-      keep that, the period), reduced to its minimal period. Without a symmetry the closed motion
+      Newton's method finds, in segments (see `arc`), with the energy of the state (or with the
+      period, if that is kept), reduced to its minimal period. Without a symmetry the closed motion
       x(T) = x(0) is solved for, unfolded by one parameter, and solved again with the symmetry that
-      it turns out to have.
+      it turns out to have. The arguments from `crossing` to `error` are of the other ways.
 
     Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
     and the pendulum are those of the root itself (implicit function theorem), second ones as
@@ -262,9 +262,10 @@ def find_orbit(
         residual; if the branch does not reach `theta1` (`NO_SUCH_ORBIT`), the orbit where it came
         closest to upright in theta1.
     Raises:
-        ValueError: theta1 not finite; none or more than one of branch and guess; theta1 a multiple
-            of pi with `branch`; both angles at an equilibrium; g not positive; an unknown branch,
-            symmetry or ratio; a period not positive.
+        ValueError: theta1 not finite; none or more than one of branch, guess and state; theta1 a
+            multiple of pi with `branch`; both angles at an equilibrium; g not positive; an unknown
+            branch, symmetry or ratio; a period not positive; a state without a period or traced by
+            `jit`; an argument of another way.
         RuntimeError: float64 is switched off in JAX.
     See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23
     (2009): families of
@@ -274,7 +275,10 @@ def find_orbit(
     require_float64()
     if state is not None or period is not None:
         others = {"theta1": theta1, "branch": branch, "guess": guess, "ratio": ratio}
+        settings = crossing, turn, tolerance, max_iterations, error
+        others |= zip(_SETTINGS, settings, strict=True)
         return _through_state(pendulum, state, period, (symmetry, turns, keep), others)
+    _leave_out("without state", {"turns": turns, "keep": keep}, {"keep": "energy"})
     theta1, crossing = number("theta1", theta1, unit="rad"), integer("crossing", crossing)
     _check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
     values = {
@@ -311,14 +315,25 @@ def find_orbit(
     return replace(centred, iterations=orbit.iterations + centred.iterations)
 
 
+# What `find_orbit` takes from a state not, with its defaults.
+_SETTINGS = {"crossing": 1, "turn": FINE, "tolerance": 1e-13, "max_iterations": 40, "error": True}
+
+
 def _through_state(
     pendulum: Any, state: Any, period: Any, options: tuple[Any, Any, Any], others: dict[str, Any]
 ) -> PeriodicOrbit:
     """The orbit near a motion, once what is asked has been looked at."""
-    mine = {"period": period} if state is None else {"state": state}
-    for name, value in others.items():
-        at_most_one(**{name: value}, **mine)
+    _leave_out("with state and period", others, _SETTINGS)
     return orbit_through(pendulum, swinging_numbers(pendulum), request_of(state, period, *options))
+
+
+def _leave_out(when: str, given: dict[str, Any], defaults: dict[str, Any]) -> None:
+    """Refuses arguments that mean nothing here; None where there is no default."""
+    for name, value in given.items():
+        default = defaults.get(name)
+        plain = isinstance(value, (bool, int, float, str))
+        if value is not default and not (plain and value == default):
+            raise ValueError(f"{name} must not be given {when}, got {shown(value)}: leave it out")
 
 
 def _check_request(

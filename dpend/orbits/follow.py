@@ -33,7 +33,7 @@ from dpend.orbits.walk import CHUNK, FAST, NEARLY, Tasks, Walk, walk
 # Resonances k:n are told, and followed, up to this k.
 LARGEST_COVER = 6
 # Steps in a segment where none were counted yet.
-_MANY_STEPS = 40
+MANY_STEPS = 40
 # Singular values below this share of the largest are zero.
 _NO_RANK = 1e-3
 # How far along the new direction the branch is looked for, and how much further to its side it may
@@ -145,7 +145,7 @@ class FamilyProblem:
         """The point of the family near one that is nearly on it, its tangent not known; None if
         there is none.
         """
-        row, steps = np.zeros(UNKNOWNS), np.array([_MANY_STEPS])
+        row, steps = np.zeros(UNKNOWNS), np.array([MANY_STEPS])
         row[release_columns(self.symmetry)] = 0.6, 0.4  # crosses any curve but by accident
         row[-2] = 1.0
         for _ in range(3):
@@ -168,7 +168,7 @@ class FamilyProblem:
             # here
         ):
             value, jacobian = (
-                np.asarray(x) for x in linearise(self.natural, point, _MANY_STEPS, self.arc)
+                np.asarray(x) for x in linearise(self.natural, point, MANY_STEPS, self.arc)
             )
             point = point - np.linalg.pinv(jacobian, rcond=_NO_RANK) @ value
         _, sizes, directions = np.linalg.svd(jacobian)
@@ -183,7 +183,7 @@ class FamilyProblem:
         new *= np.sign(new[np.argmax(np.abs(new))]) / np.sqrt(new @ (METRIC * new))
         new *= sign
         for size in _ONTO_BRANCH:
-            steps = np.array([_MANY_STEPS])
+            steps = np.array([MANY_STEPS])
             for _ in range(2):
                 rows = self.correct((point + size * new)[None], (METRIC * new)[None], steps)
                 steps = rows.steps

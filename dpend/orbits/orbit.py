@@ -62,8 +62,8 @@ class PeriodicOrbit:
             it is: the change on solving again at half the step, and what the rounding of the motion
             makes of them; NaN if that was not asked for. Without symmetry, and of a passing orbit,
             the energy is taken as it is instead; of a passing orbit the first is of the direction
-            in which it starts, the angle phi of p = L (cos
-            phi, sin phi) sqrt(2 K), L L^T being the inertia and K the kinetic energy.
+            in which it starts, the angle phi of p = L (cos phi, sin phi) sqrt(2 K), L L^T being the
+            inertia and K the kinetic energy.
         status: a value of `Status`.
         symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from
             rest), `odd` (x(T/2) = -x(0) up to full turns, never at rest), `passing` (theta in {0,

@@ -33,7 +33,7 @@ from dpend.orbits.arc import (
     stack_state,
     states_on_arc,
 )
-from dpend.orbits.follow import FamilyProblem, guess_arc
+from dpend.orbits.follow import MANY_STEPS, FamilyProblem, guess_arc
 from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.orbit import Held, PeriodicOrbit, orbits_of
 from dpend.orbits.passages import LEVELS, onto_level
@@ -54,10 +54,8 @@ _COVERS, _RETURNED = 16, 1e-6
 _STILL = 1e-6
 # A step along the family to the energy that is kept [arclength], at most.
 _ROOM = 0.5
-# No orbit that is asked for turns over more often in a period.
-_MOST_TURNS = 1000
-# Steps in a segment where none were counted yet.
-_MANY_STEPS = 40
+# Turns of one sense are counted below zero, as far as floats count.
+_LEAST_TURNS = -(2**53)
 
 
 class Request(NamedTuple):
@@ -102,7 +100,7 @@ def request_of(state: Any, period: Any, symmetry: Any, turns: Any, keep: Any) ->
                 f"them out"
             )
         pair = several("turns", turns, "a pair (turns of theta1, turns of theta2)", 2)
-        turns = tuple(integer("turns", turn, least=-_MOST_TURNS) for turn in pair)
+        turns = tuple(integer("turns", turn, least=_LEAST_TURNS) for turn in pair)
     return Request(state, period, symmetry, turns, one_of("keep", keep, ("energy", "period")))
 
 
@@ -168,7 +166,7 @@ def orbit_through(pendulum: Pendulum, fixed: Pendulum, request: Request) -> Peri
     known = [float(known_value(leaf) or 0.0) for leaf in (*jax.tree.leaves(state), period)]
     x, time = np.array(known[:4]) / [1.0, 1.0, momentum, momentum], known[4] / second
     problem = FamilyProblem(pendulum, scaled, request.symmetry or "none", (0.0, 0.0))
-    search = _Search(problem, request, _energy_of(scaled, x), time)
+    search = _Search(problem, request, float(_hamiltonian(scaled, State(*x))), time)
     root = _minimal(search, _solve(search, _move(scaled, x, time)))
     if request.symmetry is None and root.status == Status.CONVERGED:
         root = _more_symmetric(search, root)
@@ -180,10 +178,6 @@ def orbit_through(pendulum: Pendulum, fixed: Pendulum, request: Request) -> Peri
         held = Held(request.keep, target, np.zeros((1, UNKNOWNS)))
     orbit = jax.tree.map(lambda leaf: leaf[0], orbits_of(root.problem, root.rows, held))
     return replace(orbit, status=np.asarray(int(root.status)))
-
-
-def _energy_of(pendulum: Pendulum, x: np.ndarray) -> float:
-    return float(_hamiltonian(pendulum, State(*x)))
 
 
 _hamiltonian, _field = jax.jit(hamiltonian), jax.jit(vector_field)
@@ -288,7 +282,7 @@ def _solve(search: _Search, motion: _Motion) -> _Root:
         row[:4] = -slope[2], -slope[3], slope[0], slope[1]
     else:
         row[LOG_DELTA] = 1.0
-    rows = problem.correct(point[None], row[None], np.array([_MANY_STEPS]))
+    rows = problem.correct(point[None], row[None], np.array([MANY_STEPS]))
     if rows.converged[0]:
         rows = problem.correct(rows.point, METRIC * rows.tangent, rows.steps)
     if not rows.converged[0]:
@@ -313,18 +307,14 @@ def _minimal(search: _Search, root: _Root) -> _Root:
         return root
     released = root.problem.symmetry in RELEASED_SYMMETRIES
     covers = np.arange(2, _COVERS + 1)
-    times = np.zeros(_SAMPLES + 1)
+    times = np.zeros(_SAMPLES + 1)  # as many as are compiled for
     # A release is at rest after half the minimal period, and not before.
     times[: len(covers)] = root.period / (2 * covers if released else covers)
-    inside = times[: len(covers)] <= root.rows.times[0].sum() * (1 + 1e-9)
     nodes = root.rows.point[0, :LOG_DELTA].reshape(-1, 4)
-    x = _known_states(root, times)[: len(covers)]
-    gap = x - nodes[0] * (0.0 if released else 1.0)
-    gap[:, :2] -= 2 * np.pi * np.round(gap[:, :2] / (2 * np.pi))
-    if released:
-        gap[:, :2] = 0.0
+    gap = _known_states(root, times)[: len(covers)] - (0.0 if released else nodes[0])
+    gap[:, :2] -= (gap if released else 2 * np.pi * np.round(gap / (2 * np.pi)))[:, :2]
     share = np.abs(gap) / np.maximum(np.max(np.abs(nodes), axis=0), np.finfo(float).tiny)
-    back = inside & (np.max(share, axis=1) < _RETURNED)
+    back = np.max(share, axis=1) < _RETURNED
     if not np.any(back):
         return root
     k = int(covers[back][-1])
