@@ -249,7 +249,7 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) 
         if end == "closed":
             return _closed(problem, rows, ahead)
         sides.append((concatenate(rows, ahead), end))
-        if problem.symmetry != "centred" and not (problem.symmetry == "passing" and k in (3, 5)):
+        if problem.symmetry != base.problem.symmetry or k % 2 == 0:
             break  # the other side holds the same orbits, half a period later or in the mirror
     (one, end), other = sides[0], sides[1:]
     if other:

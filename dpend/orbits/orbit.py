@@ -153,8 +153,8 @@ def orbit_in_units(
         dual = replace(dual, p1=momentum * known.end_p1, p2=momentum * known.end_p2)
     whole = turns if symmetry in ("centred", "none") else 0 * turns
     if symmetry == "passing":
-        centre = (xp.round(angle / np.pi) for angle in (state.theta1, state.theta2))
-        whole = [turn - start for turn, start in zip(turns, centre, strict=True)]
+        centre = xp.nan_to_num(xp.round(xp.stack([state.theta1, state.theta2]) / np.pi))
+        whole = [turns[0] - centre[0], turns[1] - centre[1]]
     one = xp.ones_like(known.time)
     period = PARTS[symmetry] * second * known.time
     return PeriodicOrbit(

@@ -74,10 +74,10 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
         before, here, after = h[:-2], h[1:-1], h[2:]
         highest, lowest = (here >= before) & (here >= after), (here <= before) & (here <= after)
         sense = np.where(highest, 1.0, np.where(lowest, -1.0, 0.0))
-        (near,) = np.nonzero(
-            (sense != 0)
-            & (_in_reach(h, sense, targets) | _in_reach(np.sinh(h), sense, np.sinh(targets)))
-        )
+        with np.errstate(over="ignore"):  # the energy of fast rotation is steep
+            wide = np.sinh(h)
+        reach = _in_reach(h, sense, targets) | _in_reach(wide, sense, np.sinh(targets))
+        (near,) = np.nonzero((sense != 0) & reach)
         triples += [
             (function, samples.where[i : i + 3].copy(), h[i : i + 3] * sense[i], sense[i])
             for i in near
