@@ -150,7 +150,9 @@ def _describe(pendulum: Pendulum, symmetry: str = "") -> str:
     return f"{bobs}, g = {g} m/s^2, {'released from' if rests else 'never at'} rest"
 
 
-def print_orbits(pendulum: Pendulum, records: Sequence[dict[str, Any]], out: Path | None) -> None:
+def print_orbits(
+    pendulum: Pendulum, records: Sequence[dict[str, Any]], out: Path | None = None
+) -> None:
     symmetry = records[0]["symmetry"]
     rests = symmetry in RELEASED_SYMMETRIES
     moving = () if rests else ("p1 (kg m^2/s)", "p2 (kg m^2/s)", "turns")
@@ -160,8 +162,7 @@ def print_orbits(pendulum: Pendulum, records: Sequence[dict[str, Any]], out: Pat
             one.get("branch") or one["symmetry"],
             f"{one['theta1_deg']:.10g}",
             f"{one['theta2_deg']:.9f}",
-            *(() if rests else (_momentum(one["p1_kg_m2_s"]), _momentum(one["p2_kg_m2_s"]))),
-            *(() if rests else ("{}, {}".format(*one["turns"]),)),
+            *(() if rests else (*_momenta(one), "{}, {}".format(*one["turns"]))),
             f"{one['period_s']:.11f}",
             one["stability"],
             f"{one['kappa']:.6g}",
@@ -198,8 +199,8 @@ def _print_place(out: Path | None) -> None:
         print(f"written to {out}")
 
 
-def _momentum(value: float) -> str:
-    return f"{value:.12g}"
+def _momenta(row: dict[str, Any]) -> tuple[str, str]:
+    return f"{row['p1_kg_m2_s']:.10g}", f"{row['p2_kg_m2_s']:.10g}"
 
 
 def _family_point(row: dict[str, Any]) -> tuple[str, ...]:
@@ -207,9 +208,9 @@ def _family_point(row: dict[str, Any]) -> tuple[str, ...]:
     marginal = row["kind"].startswith("stability")
     logarithm = math.log(max(abs(row["kappa"]), sys.float_info.min))
     return (
-        f"{row['theta1_deg']:.9f}",
-        f"{row['theta2_deg']:.9f}",
-        *(_momentum(row[key]) for key in ("p1_kg_m2_s", "p2_kg_m2_s") if key in row),
+        f"{row['theta1_deg']:z.9f}",
+        f"{row['theta2_deg']:z.9f}",
+        *(_momenta(row) if "p1_kg_m2_s" in row else ()),
         f"{row['period_s']:.10f}",
         f"{row['energy_J']:.9f}",
         "" if marginal else dpend.stability_class(row["kappa"]),
@@ -246,8 +247,7 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
         f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding "
         f"number {agree}"
     )
-    if out is not None:
-        print(f"written to {out}")
+    _print_place(out)
 
 
 def _atlas_row(row: dict[str, Any]) -> tuple[str, ...]:

@@ -31,7 +31,8 @@ catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture plots animate report writing reading terminal options orbit_commands simulation_commands cli
+map_picture plots animate report writing reading terminal options orbit_commands
+simulation_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
