@@ -615,10 +615,10 @@ def test_the_atlas_of_an_angle(capsys, tmp_path):
 
 def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
     def forgetful(*arguments):
-        result = dpend.catalogue.scan.scan_release(*arguments)
+        result = dpend.catalogue.scan.scan_circle(*arguments)
         return dataclasses.replace(result, zeros=result.zeros[1:])
 
-    monkeypatch.setattr(dpend.catalogue.release, "scan_release", forgetful)
+    monkeypatch.setattr(dpend.catalogue.release, "scan_circle", forgetful)
     status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
     assert (status, len(found["orbits"]), found["coverage"]["suspicious_cells"]) == (1, 4, 1)
 

@@ -650,6 +650,18 @@ DOORS = {
         },
         "dpend.catalogue.release.foresee_steps",
     ),
+    "find_orbits": Door(
+        dpend.find_orbits,
+        {"pendulum": PAPER, "energy": 0.0, "max_period": 0.5, "symmetry": "passing"},
+        {
+            "pendulum": kind([*ONE_PENDULUM[0], Pendulum(g=-1.0)], [PAPER]),
+            "energy": kind([*NUMBER[0], -0.6, -1e9], [0.0, -0.5, np.float64(0.1)]),
+            "max_period": kind([*POSITIVE[0], 1e9], [0.5, np.float32(0.5)]),
+            "symmetry": kind([None, *NO_CHOICES, "brake"], ["passing"]),
+            "most_steps": kind([*POSITIVE[0], 10], [1e9, 10**9]),
+        },
+        "dpend.catalogue.energy.scan_circle",
+    ),
     "find_brake_families": Door(
         dpend.find_brake_families,
         {"pendulum": PAPER, "max_period": 1.0},

@@ -27,7 +27,8 @@ orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.impli
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.crossings orbits.special
 orbits.passages orbits.through orbits.find orbits.family orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
-catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey
+catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
+catalogue.survey
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
