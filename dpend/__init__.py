@@ -14,6 +14,8 @@ from dpend._version import __version__ as __version__
 from dpend.catalogue.atlas import Atlas as Atlas
 from dpend.catalogue.atlas import Coverage as Coverage
 from dpend.catalogue.atlas import load_atlas as load_atlas
+from dpend.catalogue.energy import Census as Census
+from dpend.catalogue.energy import find_orbits as find_orbits
 from dpend.catalogue.release import find_brake_orbits as find_brake_orbits
 from dpend.catalogue.survey import find_brake_families as find_brake_families
 from dpend.inverse.design import Design as Design

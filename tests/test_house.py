@@ -26,13 +26,15 @@ chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.crossings orbits.special
-orbits.find orbits.family orbits.continuation
+orbits.passages orbits.through orbits.find orbits.family orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
-catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey
+catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
+catalogue.survey
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture plots animate report writing terminal options orbit_commands simulation_commands cli
+map_picture plots animate report writing reading terminal options orbit_commands
+simulation_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
