@@ -17,14 +17,15 @@ import dpend
 # The public names, `dpend` itself, come last but for the doors, which draw, print and serve.
 ORDER = """
 _version _runtime checks places status records
-mechanics.trig mechanics.pendulum mechanics.linear mechanics.units
+mechanics.trig mechanics.pendulum mechanics.surface mechanics.linear mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.scheme
 motion.integrate motion.estimate motion.simulate motion.reference motion.root motion.events
-motion.gradients
+motion.crossings motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
+maps.section
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
-orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.crossings orbits.special
+orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.zones orbits.special
 orbits.find orbits.family orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey

@@ -1,0 +1,133 @@
+"""All crossings of a section, against another integrator, closed forms and each other."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dpend
+from dpend import Plane, Scheme
+
+FINE = Scheme("rk8-circle-rescaled", 8e-3)
+
+
+def lagrange(time, x):
+    """theta1, theta2 and their rates of the paper's pendulum: Lagrange's equations, written out."""
+    (theta1, theta2), (omega1, omega2) = x[:2], x[2:]
+    sine, cosine, pull = np.sin(theta1 - theta2), np.cos(theta1 - theta2), 9.8 / 0.2
+    first = -(omega2**2) * sine - 2 * pull * np.sin(theta1)
+    second = omega1**2 * sine - pull * np.sin(theta2)
+    determinant = 2 - cosine**2
+    return [
+        omega1,
+        omega2,
+        (first - cosine * second) / determinant,
+        (2 * second - cosine * first) / determinant,
+    ]
+
+
+def hits_of(pendulum, start, duration):
+    """Times and states at which DOP853 finds theta1 on a full turn."""
+    x0 = np.array([start.theta1, start.theta2, *dpend.velocities(pendulum, start)], float)
+    found = solve_ivp(
+        lagrange, (0.0, duration), x0, "DOP853", rtol=3e-14, atol=1e-15,
+        events=lambda time, x: np.sin(x[0] / 2),
+    )  # fmt: skip
+    return found.t_events[0], found.y_events[0]
+
+
+@partial(jax.jit, static_argnames=("count", "direction"))
+def found_at(pendulum, start, count=12, direction=0):
+    return dpend.crossings(Plane(), pendulum, start, count, FINE, direction=direction)
+
+
+@pytest.mark.parametrize("angles", [(1.0, 0.3), (1.6, 1.2), (2.8, 1.0)])
+def test_times_and_places_are_those_of_another_integrator(paper, angles):
+    found = found_at(paper, dpend.released(*angles))
+    times, states = hits_of(paper, dpend.released(*angles), float(found.time[-1]) + 1e-3)
+    assert times.size == 12
+    np.testing.assert_allclose(found.time, times, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found.state.theta2, states[:, 1], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.sin(found.state.theta1 / 2), 0, rtol=0, atol=1e-15)
+    rates = np.cos(found.state.theta1 / 2) * states[:, 2]
+    np.testing.assert_array_equal(found.side, np.sign(rates))
+
+
+def test_each_is_the_first_after_the_one_before(paper):
+    start = dpend.released(1.6, 1.2)
+    found = found_at(paper, start)
+    at = jax.tree.map(lambda leaf: leaf[3], found.state)
+    first = dpend.first_crossing(Plane(), paper, at, 1.0, FINE)
+    assert abs(found.time[4] - found.time[3] - first.time) < 1e-12
+    rising = found_at(paper, start, direction=1)
+    np.testing.assert_allclose(rising.time[:6], found.time[found.side == 1], rtol=0, atol=1e-12)
+
+
+def test_backwards_through_the_same_places(paper):
+    found = found_at(paper, dpend.released(1.0, 0.3))
+    last = jax.tree.map(lambda leaf: leaf[-1], found.state)
+    back = found_at(paper, last, count=-11)
+    np.testing.assert_allclose(back.time + found.time[-1], found.time[-2::-1], rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(back.side, -found.side[-2::-1])
+
+
+def level(pendulum, state):
+    return state.theta1 - pendulum.l2  # the level in the place of a parameter
+
+
+@pytest.mark.slow
+def test_two_crossings_near_a_touching_place_are_two_or_none(unit):
+    """A turning point of theta1 lies above the level by 1e-1 to 1e-13, in one step: two crossings
+    where a parabola has them; below it none, and never one.
+    """
+    start, scheme = dpend.State(-0.5, 0.2, 1.5, 0.4), Scheme("rk8-circle", 0.2)
+    turn = dpend.first_crossing(
+        lambda pendulum, state: dpend.velocities(pendulum, state)[0], unit, start, 3.0, scheme
+    )
+    top = float(turn.state.theta1)
+    bend = -float(jax.jvp(
+        lambda x: dpend.velocities(unit, x)[0], (turn.state,), (dpend.vector_field(unit, turn.state),)
+    )[1])  # fmt: skip
+    depths = 10.0 ** np.arange(-2, -14, -1)
+
+    @jax.jit
+    @jax.vmap
+    def times(height):
+        def shifted(pendulum, state):
+            return state.theta1 - height
+
+        return dpend.crossings(shifted, unit, start, 2, scheme).time - turn.time
+
+    above = np.asarray(times(top - depths))
+    half = np.sqrt(2 * depths / bend)
+    expected = np.stack([-half, half], axis=1)
+    # theta1 rounds at 1e-16, of which the square root counts.
+    near = np.maximum(0.5 * depths, 2e-16 / half)[:, None]
+    assert np.all(np.abs(above - expected) < 3 * near)
+    assert np.all(times(top + depths)[:, 0] > 1.0)
+
+
+def test_derivatives_are_those_of_the_implicit_function_theorem(paper):
+    def last(theta1):
+        found = found_at(paper, dpend.released(theta1, 0.3))
+        return jnp.stack([found.time[3], found.state.theta2[3], found.state.p2[3]])
+
+    slope, h = jax.jacfwd(last)(1.0), 1e-4
+    both = [last(1.0 + k * h) for k in (-2, -1, 1, 2)]
+    difference = (both[0] - 8 * both[1] + 8 * both[2] - both[3]) / (12 * h)
+    np.testing.assert_allclose(slope, difference, rtol=1e-8, atol=1e-11)
+
+
+def test_what_never_crosses_again_ends(paper):
+    found = dpend.crossings(level, paper, dpend.released(0.1, 0.1), 2, FINE, most_steps=500)
+    assert np.all(np.isinf(found.time))
+    assert np.all(found.side == 0)
+    assert np.all(np.isnan(found.state.p1))
+
+
+def test_count_is_checked(paper):
+    with pytest.raises(ValueError, match="count must be an integer of at least 1, got 0"):
+        dpend.crossings(level, paper, dpend.released(0.1, 0.1), 0, FINE)
