@@ -63,7 +63,7 @@ def section(
     pendulum: Pendulum | Any,
     energy: float | Any,
     *,
-    plane: Plane | Any = Plane(),
+    plane: Plane | Any | None = None,
     starts: int | Any = 64,
     count: int | Any = 200,
     points: Any | None = None,
@@ -93,14 +93,15 @@ def section(
     Returns:
         xarray.Dataset with dimensions `start` and `crossing`: `angle` [rad], within half a turn,
         `momentum`, `time` [s] and `side`; for each start `status` (NONFINITE for one that is not
-        allowed or was lost, MAX_ITERATIONS for one that crosses no more) and `energy_error`, |H - E|
-        at its last crossing [J]; coordinates `start_angle`, `start_momentum`.
+        allowed, MAX_ITERATIONS for one that crosses no more) and `energy_error`, |H - E| at its
+        last crossing [J]; coordinates `start_angle`, `start_momentum`.
     Raises:
         ValueError: an energy below that of the plane's lowest state; a start that is no number; a
             store that is there already; arguments of other classes.
     """
     pendulum = known_pendulum(pendulum)
     energy = known_number("energy", energy, unit="J")
+    plane = Plane() if plane is None else plane
     check_plane(plane)
     scheme = replace(_scheme(pendulum, scheme), written_out=True)
     lane = _Lane(plane, integer("count", count), scheme)
@@ -110,9 +111,8 @@ def section(
     starts = integer("starts", starts)
     each = _fill(pendulum, energy, plane, starts) if points is None else _points(points)
     pieces, done, taken = [], 0, 0
-    for piece in launches(
-        lane, (pendulum, energy), tuple(each.T), steps=_STEPS_A_CROSSING * lane.count
-    ):
+    steps = float(_STEPS_A_CROSSING * lane.count)
+    for piece in launches(lane, (pendulum, energy), tuple(each.T), steps=steps):
         pieces.append(piece)
         done, taken = done + piece["steps"].size, taken + int(piece["steps"].sum())
         if progress is not None:
@@ -173,11 +173,10 @@ def _label(
 
     from dpend._version import __version__
 
-    lost = ~np.isfinite(found["energy_error"]) & np.isnan(found["angle"]).any(axis=1)
     ends = np.isinf(found["time"]).any(axis=1)
-    allowed = np.isfinite(np.asarray(lane.plane.largest_momentum(pendulum, energy, each[:, 0])))
+    edge = np.asarray(lane.plane.largest_momentum(pendulum, energy, each[:, 0]))
     status = np.where(ends, int(Status.MAX_ITERATIONS), int(Status.CONVERGED))
-    status = np.where(lost & ~allowed, int(Status.NONFINITE), status)
+    status = np.where(np.abs(each[:, 1]) <= edge, status, int(Status.NONFINITE))
     both = ("start", "crossing")
     data = {
         "angle": (both, np.remainder(found["angle"] + np.pi, 2 * np.pi) - np.pi, {"units": "rad"}),

@@ -57,8 +57,9 @@ def on_energy(
     """
     check_pendulum(pendulum)
     energy = coordinate("energy", energy, unit="J")
+    rest = released(theta1, theta2)
     side = one_of("side", side, (-1, 1))
-    given = {name: value for name, value in zip(("p1", "p2", "phi"), (p1, p2, phi), strict=True)}
+    given = {"p1": p1, "p2": p2, "phi": phi}
     given = {name: value for name, value in given.items() if value is not None}
     if len(given) != 1:
         raise ValueError(
@@ -67,7 +68,14 @@ def on_energy(
         )
     ((name, value),) = given.items()
     value = coordinate(name, value, unit="rad" if name == "phi" else "kg m^2/s")
-    rest = released(theta1, theta2)
+    p1, p2 = _momenta_of(pendulum, energy, rest, name, value, side)
+    return State(rest.theta1, rest.theta2, p1, p2)
+
+
+def _momenta_of(
+    pendulum: Pendulum, energy: Scalar, rest: State, name: str, value: Scalar, side: int
+) -> tuple[Scalar, Scalar]:
+    """The momenta of `on_energy`, where `name` has this value."""
     inertia1 = (pendulum.m1 + pendulum.m2) * pendulum.l1 * pendulum.l1
     inertia2 = pendulum.m2 * pendulum.l2 * pendulum.l2
     sin_delta, cos_delta = sincos(rest.theta1 - rest.theta2)
@@ -78,14 +86,15 @@ def on_energy(
     if name == "phi":
         sine, cosine = sincos(value)
         size, edge = jnp.sqrt(twice), jnp.sqrt(inertia1)
-        first, second = edge * cosine, (coupling * cosine + jnp.sqrt(determinant) * sine) / edge
-        return State(rest.theta1, rest.theta2, size * first, size * second)
+        return size * edge * cosine, size * (
+            coupling * cosine + jnp.sqrt(determinant) * sine
+        ) / edge
     own = inertia2 if name == "p2" else inertia1
     # (det M) omega^2 = 2 K own - p^2 for the velocity whose momentum is sought.
     root = jnp.sqrt(determinant * (twice * own - value * value))
     other = (coupling * value + side * root) / own
-    p1, p2 = (other, value) if name == "p2" else (value, other)
-    return State(rest.theta1, rest.theta2, p1, p2 + 0.0 * root)
+    value = value + 0.0 * root  # of the same shape, and NaN where the other is
+    return (other, value) if name == "p2" else (value, other)
 
 
 @dataclass(frozen=True)

@@ -142,9 +142,8 @@ def crossings(
         ValueError: count zero or no integer; direction none of these; arguments of other classes,
             arrays.
     """
-    check_function(
-        "function", function, "(pendulum, state)", "lambda pendulum, state: state.theta2"
-    )
+    like = "lambda pendulum, state: state.theta2"
+    check_function("function", function, "(pendulum, state)", like)
     check_motion(pendulum, state)
     check_scheme(scheme)
     count = _counted(count)
@@ -313,9 +312,8 @@ class _Course(NamedTuple):
             return ahead
         spin = scheme.spin(unit, there)
         dt = step_for(longest, spin, march.spin)
-        return ahead._replace(
-            dt=dt, spin=spin, lost=~(jnp.abs(dt) >= SHORTEST_STEP * jnp.abs(longest))
-        )
+        lost = ~(jnp.abs(dt) >= SHORTEST_STEP * jnp.abs(longest))
+        return ahead._replace(dt=dt, spin=spin, lost=lost)
 
 
 def _probe_from(sign: Scalar) -> Probe:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from dpend.orbits.zones import Zone, find_zones, merge_samples, outside, overlaps
 from dpend.orbits.curve import Curve, select
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.newton import Solved
@@ -27,6 +26,7 @@ from dpend.orbits.samples import (
     values_of_tests,
 )
 from dpend.orbits.walk import CROSSING
+from dpend.orbits.zones import Zone, find_zones, merge_samples, outside, overlaps
 
 
 def special_points(
