@@ -44,7 +44,7 @@ def on_energy(
 
     Arguments:
         energy: H [J], zero for both bobs at rest at the pivot's height; like the angles and momenta
-            a number or an array, all of one shape.
+            a number or an array, shapes that broadcast.
         theta1, theta2: angles [rad].
         p1, p2: canonical momentum [kg m^2/s].
         phi: direction [rad].
@@ -69,7 +69,7 @@ def on_energy(
     ((name, value),) = given.items()
     value = coordinate(name, value, unit="rad" if name == "phi" else "kg m^2/s")
     p1, p2 = _momenta_of(pendulum, energy, rest, name, value, side)
-    return State(rest.theta1, rest.theta2, p1, p2)
+    return State(*jnp.broadcast_arrays(rest.theta1, rest.theta2, p1, p2))
 
 
 def _momenta_of(
@@ -123,7 +123,11 @@ class Plane:
         return ("theta2", "p2") if self.angle == "theta1" else ("theta1", "p1")
 
     def __call__(self, pendulum: Pendulum | Any, state: State | Any) -> Scalar:
-        """sin((theta - at)/2), zero on the plane and nowhere else."""
+        """sin((theta - at)/2), zero on the plane and nowhere else.
+
+        After an odd number of full turns it falls where the angle rises: `side` does not ask for
+        turns.
+        """
         check_mechanics(pendulum, state)
         return sincos(0.5 * (getattr(state, self.angle) - self.at))[0]
 

@@ -159,7 +159,7 @@ def _counted(count: Any) -> int:
     except ValueError as refusal:
         try:
             return -integer("count", -count)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, ArithmeticError):
             raise refusal from None
 
 

@@ -12,16 +12,16 @@ def test_a_section_is_the_crossings_of_its_starts(paper, tmp_path):
     scheme = dpend.Scheme("rk8-circle-rescaled", 8e-3)
     seen = []
     found = dpend.section(
-        paper, -0.2, starts=70, count=6, scheme=scheme, store=tmp_path / "S.zarr",
+        paper, -0.2, starts=70, count=23, scheme=scheme, store=tmp_path / "S.zarr",
         progress=lambda *counts: seen.append(counts),
     )  # fmt: skip
-    assert seen[-1][:2] == (70, 70)
+    assert seen[-1][:2] == (70 * 23, 70 * 23)
     assert np.all(found.status == dpend.Status.CONVERGED)
     assert np.all(found.energy_error < 1e-9)
     for i in (0, 69):
         angle, momentum = float(found.start_angle[i]), float(found.start_momentum[i])
         start = dpend.on_energy(paper, -0.2, 0.0, angle, p2=momentum)
-        one = dpend.crossings(Plane(), paper, start, 6, scheme)
+        one = dpend.crossings(Plane(), paper, start, 23, scheme)
         np.testing.assert_allclose(found.time[i], one.time, rtol=0, atol=1e-12)
         turned = np.remainder(found.angle[i] - one.state.theta2, 2 * np.pi)
         np.testing.assert_allclose(np.minimum(turned, 2 * np.pi - turned), 0, rtol=0, atol=1e-11)
@@ -34,9 +34,9 @@ def test_a_section_is_the_crossings_of_its_starts(paper, tmp_path):
 
 def test_starts_fill_what_is_allowed_evenly(paper):
     """Quarters of the area hold quarters of the starts."""
-    from dpend.maps.section import _fill
+    from dpend.maps.section import fill
 
-    starts = _fill(paper, -0.3, Plane(), 4000)
+    starts = fill(paper, -0.3, Plane(), 4000)
     edge = np.asarray(Plane().largest_momentum(paper, -0.3, starts[:, 0]))
     assert np.all(np.abs(starts[:, 1]) < edge)
     quarters = 2 * (starts[:, 0] > 0) + (starts[:, 1] > 0)
