@@ -316,6 +316,24 @@ def print_map(found: dict[str, Any], figure: Path | None) -> None:
     print(f"written to {found['out']}" + (f", drawn in {figure}" if figure else ""))
 
 
+def print_section(found: dict[str, Any], figure: Path | None) -> None:
+    print(
+        f"{found['crossings']} crossings by {found['starts']} motions of {found['energy_J']:g} J, "
+        f"right to {found['largest_energy_error_J']:.0e} J; {found['failed']} motions failed"
+    )
+    columns = "returns", "angle_deg", "momentum_kg_m2_s", "period_s", "stability", "kappa"
+    forms = "{}", "{:.9f}", "{:.12f}", "{:.11f}", "{}", "{:.6g}"
+    rows = [
+        [form.format(row[key]) for form, key in zip(forms, columns, strict=True)]
+        for row in found["periodic_orbits"]
+    ]
+    headings = "returns", "angle (deg)", "momentum (kg m^2/s)", "period (s)", "stability", "kappa"
+    if rows:
+        _print_table("periodic orbits, the first point of each", headings, rows)
+    written = {"written to": found["out"], "drawn in": figure}
+    print(*(f"{how} {where}" for how, where in written.items() if where), sep=", ")
+
+
 def print_films(found: dict[str, Any], releases: Sequence[tuple[float, float]]) -> None:
     count = len(releases)
     print(

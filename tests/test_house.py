@@ -23,7 +23,7 @@ motion.integrate motion.estimate motion.simulate motion.reference motion.root mo
 motion.crossings motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
-maps.section
+maps.section maps.returns
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.zones orbits.special
 orbits.find orbits.family orbits.continuation
@@ -32,7 +32,8 @@ catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture plots animate report writing terminal options orbit_commands simulation_commands cli
+map_picture section_picture plots animate report writing terminal options orbit_commands
+simulation_commands section_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.

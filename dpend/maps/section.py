@@ -101,7 +101,7 @@ def section(
     energy = known_number("energy", energy, unit="J")
     plane = known_plane(plane)
     count, starts = integer("count", count), integer("starts", starts)
-    each = None if points is None else _points(points)
+    each = None if points is None else points_in("points", points)
     place = None if store is None else file_path("store", store)
     if place is not None:
         check_new("store", place)
@@ -133,11 +133,16 @@ def scheme_or(pendulum: Pendulum, scheme: Any, tolerance: float) -> Scheme:
     return scheme
 
 
-def _points(points: Any) -> np.ndarray:
-    array = numbers("points", points)
+def points_in(name: str, points: Any) -> np.ndarray:
+    """Points (angle, momentum) of a plane, as an array of shape (n, 2).
+
+    Raises:
+        ValueError: another shape; none; a value that is no finite number.
+    """
+    array = numbers(name, points)
     if array.ndim != 2 or array.shape[1] != 2 or not array.size or not np.all(np.isfinite(array)):
         raise ValueError(
-            f"points must be pairs of a finite angle and momentum, shape (n, 2), got "
+            f"{name} must be pairs of a finite angle and momentum, shape (n, 2), got "
             f"{shown(points)}: give one like [(0.1, 0.0)]"
         )
     return array

@@ -146,19 +146,23 @@ def crossings(
     check_function("function", function, "(pendulum, state)", like)
     check_motion(pendulum, state)
     check_scheme(scheme)
-    count = _counted(count)
+    count = signed_count("count", count)
     direction = one_of("direction", direction, (-1, 0, 1))
     most = jnp.asarray(integer("most_steps", most_steps), jnp.float64)
     return _crossings(function, pendulum, state, count, scheme, direction, most)
 
 
-def _counted(count: Any) -> int:
-    """How many crossings, negative ones backwards."""
+def signed_count(name: str, count: Any) -> int:
+    """How many, as an integer of at least 1; negative ones backwards.
+
+    Raises:
+        ValueError: zero, or no integer.
+    """
     try:
-        return integer("count", count)
+        return integer(name, count)
     except ValueError as refusal:
         try:
-            return -integer("count", -count)
+            return -integer(name, -count)
         except (ValueError, TypeError, ArithmeticError):
             raise refusal from None
 
