@@ -528,6 +528,38 @@ DOORS = {
         },
         "dpend.maps.section.launches",
     ),
+    "return_map": Door(
+        dpend.return_map,
+        {"pendulum": PAPER, "energy": -0.2, "angle": 0.1, "momentum": 0.0, "scheme": FINE},
+        {
+            "pendulum": ONE_PENDULUM,
+            "scheme": SCHEME,
+            **dict.fromkeys(("energy", "angle", "momentum"), NUMBER),
+            "returns": kind([*NO_INTEGERS, 0], [*ONES, -3, np.int64(-1)]),
+            "plane": kind([PAPER, *NO_OBJECTS], [dpend.Plane("theta2")], none=True),
+            "side": kind([None, *NO_CHOICES, 0, 2], [1, np.int64(-1)]),
+        },
+        "dpend.maps.returns._come_back",
+    ),
+    "periodic_points": Door(
+        dpend.periodic_points,
+        {"pendulum": PAPER, "energy": -0.2},
+        {
+            "pendulum": kind([*ONE_PENDULUM[0], Pendulum(g=0.0)], [PAPER]),
+            "energy": kind([*NO_NUMBERS, *NO_ARRAYS, -0.6], HALVES),
+            "returns": COUNT,
+            "plane": kind([PAPER, *NO_OBJECTS], [dpend.Plane("theta2")], none=True),
+            "near": kind(
+                [*NO_OBJECTS, [(0.1, math.nan)], [0.1, 0.2], [(0.1, "1")]],
+                [[(0.1, 0.0)], np.array([[0.1, 0.0], [0.2, 0.0]])],
+                none=True,
+            ),
+            "starts": COUNT,
+            "scheme": kind(SCHEME[0][1:], [FINE], none=True),
+            "progress": PROGRESS,
+        },
+        "dpend.maps.periodic.launches",
+    ),
     "monodromy": Door(
         dpend.monodromy,
         {"pendulum": PAPER, "state": RELEASE, "period": 1.0, "scheme": FINE},
@@ -932,6 +964,11 @@ DOORS = {
         {},
         {"dataset": kind([None, *NO_OBJECTS, SAVED]), "name": ANY, "ax": ANY},
     ),
+    "plots.section": Door(
+        dpend.plots.section,
+        {},
+        {"dataset": kind([None, *NO_OBJECTS, SAVED]), "periodic": ANY, "ax": ANY},
+    ),
     "plots.residuals": Door(dpend.plots.residuals, {}, {"fit": kind([None, SAVED, *NO_OBJECTS])}),
     "animate.motions_for": Door(
         dpend.animate.motions_for,
@@ -1084,6 +1121,7 @@ TRACEABLE = {
     *((name, "duration") for name in ("flow", "fold")),
     ("fold", "init"),
     *(("on_energy", name) for name in ("energy", "theta1", "theta2", "p2")),
+    *(("return_map", name) for name in ("energy", "angle", "momentum")),
     ("reference", "tolerance"),
     ("multipliers", "kappa"),
     *(("find_orbit", name) for name in ("theta1", "turn", "tolerance", "max_iterations")),

@@ -23,7 +23,7 @@ motion.integrate motion.estimate motion.simulate motion.reference motion.root mo
 motion.crossings motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
-maps.section maps.returns
+maps.section maps.returns maps.periodic
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.zones orbits.special
 orbits.find orbits.family orbits.continuation

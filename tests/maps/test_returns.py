@@ -14,7 +14,7 @@ from dpend.maps.section import fill
 @partial(jax.jit, static_argnames=("returns", "plane"))
 def back(pendulum, energy, point, returns=1, plane=None):
     found = dpend.return_map(
-        pendulum, energy, *point, returns=returns, plane=plane, scheme=dpend.Scheme("rk8", 4e-3)
+        pendulum, energy, *point, dpend.Scheme("rk8", 4e-3), returns=returns, plane=plane
     )
     return jax.numpy.stack([found.angle, found.momentum])
 
@@ -91,7 +91,7 @@ def test_a_search_finds_each_orbit_once_with_its_mirror_image(paper):
         for each in mirror[:, 0]:
             gap = np.abs(points - each).max(axis=2)
             assert np.sum(gap.min(axis=1) < 1e-8) == 1
-    # Both modes are stable there, and as many orbits saddles as centres: the Poincare-Birkhoff
-    # theorem for the chains, an index of two for the disc of all.
-    kappa = found[1].kappa.values
-    assert np.sum(np.abs(kappa) < 1) - np.sum(kappa > 1) in (0, 1, 2)
+    # Each chain of three has as many orbits that are saddles as that are centres (Poincare and
+    # Birkhoff), and there are two.
+    kappa = found[3].kappa.values
+    assert np.sum(np.abs(kappa) < 1) == np.sum((kappa > 1) & (kappa < 1.01)) == 2
