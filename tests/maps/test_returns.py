@@ -19,6 +19,7 @@ def back(pendulum, energy, point, returns=1, plane=None):
     return jax.numpy.stack([found.angle, found.momentum])
 
 
+@pytest.mark.slow
 def test_there_and_back_is_where_it_was(paper):
     """A rotating motion, whose angle crosses the plane once in every turn, in the same sense."""
     start = np.array([0.4, 0.05])

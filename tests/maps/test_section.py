@@ -21,11 +21,11 @@ def test_a_section_is_the_crossings_of_its_starts(paper, tmp_path):
     for i in (0, 69):
         angle, momentum = float(found.start_angle[i]), float(found.start_momentum[i])
         start = dpend.on_energy(paper, -0.2, 0.0, angle, p2=momentum)
-        one = dpend.crossings(Plane(), paper, start, 23, scheme)
-        np.testing.assert_allclose(found.time[i], one.time, rtol=0, atol=1e-12)
-        turned = np.remainder(found.angle[i] - one.state.theta2, 2 * np.pi)
+        one = dpend.crossings(Plane(), paper, start, 12, scheme)
+        np.testing.assert_allclose(found.time[i, :12], one.time, rtol=0, atol=1e-12)
+        turned = np.remainder(found.angle[i, :12] - one.state.theta2, 2 * np.pi)
         np.testing.assert_allclose(np.minimum(turned, 2 * np.pi - turned), 0, rtol=0, atol=1e-11)
-        np.testing.assert_allclose(found.momentum[i], one.state.p2, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.momentum[i, :12], one.state.p2, rtol=0, atol=1e-12)
     kept = xarray.open_zarr(tmp_path / "S.zarr", consolidated=False)
     xarray.testing.assert_identical(kept.load(), found)
     with pytest.raises(ValueError, match="store must be a new name .*it is there already"):
