@@ -207,8 +207,12 @@ class Watch(NamedTuple):
         of their values.
         """
         moves = [dt * slope for slope in jax.tree.leaves(vector_field(self.pendulum, state))]
-        pairs = zip(jax.tree.leaves(state), moves, strict=True)
-        sizes = [jnp.abs(x) + jnp.abs(move) for x, move in pairs]
+        # Both velocities are differences of the same terms, and so are both forces: where one is
+        # small, the rounding of the other's terms is in it.
+        theta1, theta2, p1, p2 = (jnp.abs(move) for move in moves)
+        largest = (theta1 + theta2,) * 2 + (p1 + p2,) * 2
+        pairs = zip(jax.tree.leaves(state), largest, strict=True)
+        sizes = [jnp.abs(x) + move for x, move in pairs]
         measures = []
         for value, gradient in zip(self.values(state), jax.jacfwd(self.values)(state), strict=True):
             parts = jax.tree.leaves(gradient)

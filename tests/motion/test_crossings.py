@@ -80,6 +80,21 @@ def test_all_are_those_of_a_taylor_series_in_extended_precision(paper):
     np.testing.assert_allclose(found.state.theta2, np.array(places, float), rtol=0, atol=1e-10)
 
 
+def test_a_start_that_nearly_touches_the_section_comes_back_at_once(paper):
+    """theta1 rises at 4e-5 rad/s, the difference of terms that are 3e5 as large, and falls back
+    within 14 microseconds.
+    """
+    edge = float(Plane().largest_momentum(paper, 0.1, -3.080298))
+    start = dpend.on_energy(paper, 0.1, 0.0, -3.080298, p2=-edge * (1 - 6e-12))
+    omega = dpend.velocities(paper, start)
+    bend = lagrange(0.0, np.array([0.0, -3.080298, *omega], float))[2]
+    found = found_at(paper, start)
+    np.testing.assert_allclose(found.time[0], -2 * omega[0] / bend, rtol=1e-3)
+    times, _ = hits_of(paper, start, 1.0)  # which has no event beside its start
+    np.testing.assert_allclose(found.time[1:4], times[-3:], rtol=0, atol=1e-10)
+    assert 0.015 < times[-3] < 0.016
+
+
 def test_each_is_the_first_after_the_one_before(paper):
     start = dpend.released(1.6, 1.2)
     found = found_at(paper, start)
