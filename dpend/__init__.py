@@ -14,6 +14,8 @@ from dpend._version import __version__ as __version__
 from dpend.catalogue.atlas import Atlas as Atlas
 from dpend.catalogue.atlas import Coverage as Coverage
 from dpend.catalogue.atlas import load_atlas as load_atlas
+from dpend.catalogue.energy import Census as Census
+from dpend.catalogue.energy import find_orbits as find_orbits
 from dpend.catalogue.release import find_brake_orbits as find_brake_orbits
 from dpend.catalogue.survey import find_brake_families as find_brake_families
 from dpend.inverse.design import Design as Design
@@ -57,8 +59,8 @@ from dpend.motion.gradients import gradient_horizon as gradient_horizon
 from dpend.motion.integrate import flow as flow
 from dpend.motion.integrate import fold as fold
 from dpend.motion.reference import reference as reference
-from dpend.motion.simulate import Trajectory as Trajectory
 from dpend.motion.simulate import simulate as simulate
+from dpend.motion.trajectory import Trajectory as Trajectory
 from dpend.orbits.continuation import follow_family as follow_family
 from dpend.orbits.family import Family as Family
 from dpend.orbits.find import find_orbit as find_orbit

@@ -443,18 +443,36 @@ DOORS = {
             "method": kind(
                 [*NO_CHOICES, "rk8-circle-rescaled"], ["rk4", np.str_("rk8")], none=True
             ),
-            "save_every": COUNT,
+            "save_every": kind(COUNT[0], COUNT[1], none=True),
             "most_steps": BUDGET,
             "error": FLAG,
             "tolerance": kind(POSITIVE[0][1:]),
         },
-        "dpend.motion.simulate._simulate",
+        "dpend.motion.stepped._simulate",
     ),
     "simulate, for a tolerance": Door(
         dpend.simulate,
         {"pendulum": PAPER, "state": RELEASE, "duration": 1.0},
-        {"tolerance": MAYBE_POSITIVE},
-        "dpend.motion.simulate.find_scheme",
+        {
+            "pendulum": PENDULUM,
+            "state": STATE,
+            "duration": kind([*NUMBER[0], 0, 0.0], HALVES),
+            "tolerance": MAYBE_POSITIVE,
+            "most_steps": BUDGET,
+        },
+        "dpend.motion.simulate.one_motion",
+    ),
+    "simulate, at times": Door(
+        dpend.simulate,
+        {"pendulum": PAPER, "state": RELEASE, "times": [1.0]},
+        {"times": kind(GRID[0][1:], GRID[1])},
+        "dpend.motion.simulate.one_motion",
+    ),
+    "simulate, at ends of steps": Door(
+        dpend.simulate,
+        {"pendulum": PAPER, "state": RELEASE, "duration": 1.0, "save_every": 2},
+        {"save_every": kind(COUNT[0][1:], COUNT[1]), "state": ONE_STATE},
+        "dpend.motion.simulate.motion_at_steps",
     ),
     "reference": Door(
         dpend.reference,
@@ -593,6 +611,10 @@ DOORS = {
             "max_iterations": COUNT,
             "error": FLAG,
             "guess": kind([(1.0, 1.0)]),
+            "state": kind([RELEASE]),
+            "period": kind([1.0]),
+            "turns": kind([(0, 0)]),
+            "keep": kind(["period", None]),
         },
         "dpend.orbits.find._on_branch",
     ),
@@ -629,6 +651,40 @@ DOORS = {
         },
         "dpend.orbits.find._near_guess",
     ),
+    "find_orbit, from a state": Door(
+        dpend.find_orbit,
+        {"pendulum": PAPER, "state": RELEASE, "period": 1.0},
+        {
+            "pendulum": kind([*ONE_PENDULUM[0], Pendulum(g=0.0)], [PAPER]),
+            "state": kind([*ONE_STATE[0], dpend.released(jnp.asarray(math.nan), 0.5)], [RELEASE]),
+            "period": POSITIVE,
+            "symmetry": kind(NO_CHOICES, ["centred", "brake", "odd", "passing", "none"], none=True),
+            "turns": kind([(1, 0)]),
+            "keep": kind([None, *NO_CHOICES], ["period", "energy"]),
+            "theta1": kind([0.5]),
+            "branch": kind(["in-phase"]),
+            "guess": kind([(0.7, 1.0)]),
+            "ratio": kind([1]),
+            "crossing": kind([2, jnp.asarray(2), np.ones(2), "1"]),
+            "turn": kind([0.2, None]),
+            "tolerance": kind([1e-9]),
+            "max_iterations": kind([3]),
+            "error": kind([False]),
+        },
+        "dpend.orbits.find.orbit_through",
+    ),
+    "find_orbit, passing": Door(
+        dpend.find_orbit,
+        {"pendulum": PAPER, "state": RELEASE, "period": 1.0, "symmetry": "passing"},
+        {
+            "turns": kind(
+                [*NO_OBJECTS, (1,), (1, 0, 0), (1, 0.5), (1, None), (1, 10**20), "10"],
+                [(1, 0), [0, -2], np.array([0, 1])],
+                none=True,
+            ),
+        },
+        "dpend.orbits.find.orbit_through",
+    ),
     "follow_family": Door(
         dpend.follow_family,
         {"pendulum": PAPER, "start": "in-phase"},
@@ -654,7 +710,31 @@ DOORS = {
             ),
             "crossing": COUNT,
         },
-        "dpend.orbits.family._passages",
+        "dpend.orbits.family._points_at",
+    ),
+    "Family.at, an energy": Door(
+        FAMILY.at,
+        {"energy": -0.5},
+        {
+            "energy": kind(
+                [*NO_COLUMNS, [], math.nan, [0.5, math.inf]],
+                [*HALVES, -0.5, [0.1, 0.2], np.ones((2, 2))],
+            ),
+            "theta1": kind([0.5]),
+        },
+        "dpend.orbits.family._points_at",
+    ),
+    "Family.at, a period": Door(
+        FAMILY.at,
+        {"period": 1.0},
+        {
+            "period": kind(
+                [*NO_COLUMNS, [], math.nan, [0.5, math.inf], 0.0, -1],
+                [*HALVES, [0.9, 1.2], np.ones((2, 2))],
+            ),
+            "energy": kind([0.5]),
+        },
+        "dpend.orbits.family._points_at",
     ),
     "find_brake_orbits": Door(
         dpend.find_brake_orbits,
@@ -667,6 +747,18 @@ DOORS = {
             "progress": PROGRESS,
         },
         "dpend.catalogue.release.foresee_steps",
+    ),
+    "find_orbits": Door(
+        dpend.find_orbits,
+        {"pendulum": PAPER, "energy": 0.0, "max_period": 0.5, "symmetry": "passing"},
+        {
+            "pendulum": kind([*ONE_PENDULUM[0], Pendulum(g=-1.0)], [PAPER]),
+            "energy": kind([*NUMBER[0], -0.6, -1e9], [0.0, -0.5, np.float64(0.1)]),
+            "max_period": kind([*POSITIVE[0], 1e9], [0.5, np.float32(0.5)]),
+            "symmetry": kind([None, *NO_CHOICES, "brake"], ["passing"]),
+            "most_steps": kind([*POSITIVE[0], 10], [1e9, 10**9]),
+        },
+        "dpend.catalogue.energy.scan_circle",
     ),
     "find_brake_families": Door(
         dpend.find_brake_families,
@@ -1123,12 +1215,17 @@ TRACEABLE = {
     *(("on_energy", name) for name in ("energy", "theta1", "theta2", "p2")),
     *(("return_map", name) for name in ("energy", "angle", "momentum")),
     ("reference", "tolerance"),
+    ("simulate, at times", "times"),
     ("multipliers", "kappa"),
     *(("find_orbit", name) for name in ("theta1", "turn", "tolerance", "max_iterations")),
 }
 DIFFERENTIABLE = TRACEABLE | {
     ("simulate", "duration"),
+    ("simulate, for a tolerance", "duration"),
     ("Family.at", "theta1"),
+    ("Family.at, an energy", "energy"),
+    ("Family.at, a period", "period"),
+    ("find_orbit, from a state", "period"),
     ("stability_class", "kappa"),
 }
 TRANSFORMATIONS = {

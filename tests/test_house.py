@@ -18,22 +18,24 @@ import dpend
 ORDER = """
 _version _runtime checks places status records
 mechanics.trig mechanics.pendulum mechanics.surface mechanics.linear mechanics.units
-methods.runge_kutta methods.circle methods.gauss methods.scheme
-motion.integrate motion.estimate motion.simulate motion.reference motion.root motion.events
+methods.runge_kutta methods.circle methods.gauss methods.nodes methods.collocation methods.scheme
+motion.integrate motion.estimate motion.trajectory motion.adaptive motion.variation motion.saved
+motion.stepped motion.tables motion.simulate motion.reference motion.root motion.events
 motion.crossings motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
 maps.section maps.returns maps.periodic
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.zones orbits.special
-orbits.find orbits.family orbits.continuation
+orbits.passages orbits.through orbits.find orbits.family orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
-catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey
+catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
+catalogue.survey
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture section_picture plots animate report writing terminal options orbit_commands
-simulation_commands section_commands cli
+map_picture section_picture plots animate tables report writing reading terminal options
+orbit_commands simulation_commands section_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
@@ -41,7 +43,7 @@ LAZY = {("dpend", "plots"), ("dpend", "animate")}
 # Sizes: lines of a file, lines of code and McCabe's complexity of a function. What is above them
 # says why in a comment beside it, or waits to be written anew.
 LONGEST_FILE, LONGEST_FUNCTION, MOST_BRANCHES = 350, 40, 12
-LONG_FILES = {"orbits/find.py", "orbits/special.py", "motion/simulate.py"}
+LONG_FILES = {"orbits/find.py", "orbits/special.py"}
 LONG_FUNCTIONS = {
     "map_command", "atlas", "orbit", "simulate", "fit",  # options, one a line
     "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation
@@ -49,7 +51,7 @@ LONG_FUNCTIONS = {
 }  # fmt: skip
 BRANCHING = {"find_orbit", "_check_request", "follow_curve"}
 # The command line prints results and, on standard error, what it does.
-PRINTING = ["report", "terminal"]
+PRINTING = ["report", "tables", "terminal"]
 
 
 def name_of(path: Path) -> str:
