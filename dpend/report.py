@@ -16,13 +16,10 @@ from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.orbit import PeriodicOrbit
 from dpend.records import columns, json_text, record
 from dpend.status import Status
+from dpend.tables import print_table
 
-# Wider than any table here: a number is never broken to fit a terminal.
-_TABLE_WIDTH = 200
 # Rows of the table that stand for a family.
 _SHOWN_POINTS = 12
-# Columns of words, which begin at the left; numbers end at the right.
-_WORDS = ("", "symmetry", "stability", "family", "from", "to")
 # What a design tells the derivatives of: its name, and what it is multiplied by.
 _SLOPES = {
     "theta2_deg": ("theta2", math.degrees(1.0)),
@@ -122,21 +119,6 @@ def print_json(found: dict[str, Any]) -> None:
     print(json_text(found))
 
 
-def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", title_style="")
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in _WORDS else "right")
-    for row in rows:
-        table.add_row(*row)
-    console = Console(width=_TABLE_WIDTH, highlight=False)
-    with console.capture() as text:
-        console.print(table)
-    print(text.get(), end="")
-
-
 def _print_failure(found: dict[str, Any], whose: str = "") -> None:
     if found["status"] != "converged":
         print(f"{whose}{found['status']}: {found['message']}")
@@ -169,7 +151,7 @@ def print_orbits(
         )
         for one in records
     ]
-    _print_table(_describe(pendulum, symmetry), (*headings, "error (deg, s)"), rows)
+    print_table(_describe(pendulum, symmetry), (*headings, "error (deg, s)"), rows)
     for one in records:
         _print_failure(one, f"{one.get('branch') or 'guess'}: ")
     _print_place(out)
@@ -184,7 +166,7 @@ def print_family(found: dict[str, Any], out: Path | None) -> None:
     headings = ("theta1 (deg)", "theta2 (deg)", *moving, "period (s)", "energy (J)", "stability")
     rows = [_family_point(row) for row in sorted(shown, key=lambda row: row["arclength"])]
     pendulum = Pendulum(*found["pendulum"].values())
-    _print_table(_describe(pendulum, symmetry), (*headings, "log |kappa|", "special", ""), rows)
+    print_table(_describe(pendulum, symmetry), (*headings, "log |kappa|", "special", ""), rows)
     worst = max(point["theta2_error_deg"] for point in points)
     what = "the direction at the start" if symmetry == "passing" else "theta2"
     ends = "{} {} orbits from {} to {}".format(len(points), symmetry, *found["ends"])
@@ -223,12 +205,12 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
     title = _describe(atlas.pendulum)
     if theta1 is None:
         families = [_family_row(atlas, one) for one in atlas.families]
-        _print_table(title, ("family", "periods (s)", "from", "to", "orbits"), families)
+        print_table(title, ("family", "periods (s)", "from", "to", "orbits"), families)
         what = f"{len(atlas.families)} families with {len(atlas)} orbits in the table"
     else:
         headings = ("theta2 (deg)", "period (s)", "symmetry", "stability", "kappa", "dual (deg)")
         orbits = [_atlas_row(orbit_record(orbit)) for orbit in atlas.orbits]
-        _print_table(title, (*headings, "error (deg)"), orbits)
+        print_table(title, (*headings, "error (deg)"), orbits)
         what = f"{len(atlas)} orbits with theta1 = {theta1:g} deg"
     seen = atlas.coverage
     print(
@@ -304,7 +286,7 @@ def print_design(found: dict[str, Any], theta1: float) -> None:
         f"{one['branch']}\n{heading}" for one in orbits for heading in _SLOPE_HEADINGS.values()
     ]
     title = "derivatives with respect to the logarithms"
-    _print_table(title, ("", "start", "found", *headings), rows)
+    print_table(title, ("", "start", "found", *headings), rows)
     missed = ", ".join(f"{name} {value:.0e}" for name, value in found["missed"].items())
     bounds = f"; at bounds: {', '.join(found['at_bounds'])}" if found["at_bounds"] else ""
     print(
@@ -336,6 +318,24 @@ def print_map(found: dict[str, Any], figure: Path | None) -> None:
         f"{found['scheme']['step_s']:.4g} s"
     )
     print(f"written to {found['out']}" + (f", drawn in {figure}" if figure else ""))
+
+
+def print_section(found: dict[str, Any], figure: Path | None) -> None:
+    print(
+        f"{found['crossings']} crossings by {found['starts']} motions of {found['energy_J']:g} J, "
+        f"right to {found['largest_energy_error_J']:.0e} J; {found['failed']} motions failed"
+    )
+    columns = "returns", "angle_deg", "momentum_kg_m2_s", "period_s", "stability", "kappa"
+    forms = "{}", "{:.9f}", "{:.12f}", "{:.11f}", "{}", "{:.6g}"
+    rows = [
+        [form.format(row[key]) for form, key in zip(forms, columns, strict=True)]
+        for row in found["periodic_orbits"]
+    ]
+    headings = "returns", "angle (deg)", "momentum (kg m^2/s)", "period (s)", "stability", "kappa"
+    if rows:
+        print_table("periodic orbits, the first point of each", headings, rows)
+    written = {"written to": found["out"], "drawn in": figure}
+    print(*(f"{how} {where}" for how, where in written.items() if where), sep=", ")
 
 
 def print_films(found: dict[str, Any], releases: Sequence[tuple[float, float]]) -> None:

@@ -849,3 +849,36 @@ def test_a_noise_that_no_angle_has_is_refused(capsys, monkeypatch, tmp_path):
         2,
         "dpend: data.csv must have one column theta2_deg, got 2: keep one of them\n",
     )
+
+
+@pytest.mark.slow
+def test_a_section_with_its_store_its_picture_and_its_orbits(capsys, tmp_path):
+    out, figure = tmp_path / "S.zarr", tmp_path / "S.png"
+    status, found = run_json(
+        capsys, "section", "--energy", -0.42, "--starts", 5, "--count", 12, "--periodic", 2,
+        "--out", out, "--figure", figure,
+    )  # fmt: skip
+    assert (status, found["failed"], found["crossings"]) == (0, 0, 60)
+    assert found["largest_energy_error_J"] < 1e-9
+    kappa = {row["returns"]: row["kappa"] for row in found["periodic_orbits"]}
+    assert kappa.keys() == {1, 2}
+    in_phase = found["periodic_orbits"][3]  # the longest of one return
+    assert abs(in_phase["period_s"] - 1.21) < 0.01
+    assert in_phase["stability"] == "elliptic"
+    assert figure.stat().st_size > 10_000
+    assert (out / "zarr.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--energy", -9), "energy must be above the lowest one on .*, got -9 J: give a higher"),
+        (("--energy", 0, "--angle", "x"), "angle must be one of theta1, theta2, got 'x'"),
+        (("--energy", 0, "--count", 0), "count must be an integer of at least 1, got 0"),
+        (("--energy", 0, "--out", "."), "out must be a new name in a directory .*already"),
+    ],
+)
+def test_bad_sections_are_refused_in_one_line(capsys, words, line):
+    status, out, err = run(capsys, "section", *words)
+    assert (status, out) == (2, "")
+    assert re.fullmatch(f"dpend: {line}.*\n", err), err

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from dpend.orbits.crossings import Zone, crossings, merge_samples, outside, overlaps
 from dpend.orbits.curve import Curve, select
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.newton import Solved
@@ -27,6 +26,7 @@ from dpend.orbits.samples import (
     values_of_tests,
 )
 from dpend.orbits.walk import CROSSING
+from dpend.orbits.zones import Zone, find_zones, merge_samples, outside, overlaps
 
 
 def special_points(
@@ -37,7 +37,7 @@ def special_points(
     """
     track = Track(problem, curve, arclength)
     samples = Samples(arclength[len(arclength) - len(rows.point) :], rows)
-    zones = crossings(track, samples)
+    zones = find_zones(track, samples)
     samples = outside(zones, _with_extrema(track, outside(zones, samples, with_ends=True)))
     changes = _changes(problem, samples)
     places = [
