@@ -373,6 +373,16 @@ DOORS = {
         {"pendulum": PENDULUM, "state": STATE},
         "dpend.mechanics.pendulum.sincos",
     ),
+    "configure": Door(
+        dpend.configure,
+        {},
+        {
+            "devices": kind(COUNT[0], [jax.local_device_count()], none=True),
+            "async_dispatch": kind(NO_FLAGS, none=True),
+            "x64": kind(NO_FLAGS, [True, np.True_]),
+        },
+        "dpend.machine.is_running",
+    ),
     "normal_modes": Door(
         dpend.normal_modes,
         {"pendulum": PAPER},
