@@ -4,7 +4,8 @@ Each picture shows the plane theta1 = 0, theta1 rising: one colour a motion, rin
 stable and unstable orbits of one to three returns. At the lowest energies curves surround the orbit
 of the anti-phase mode. The curve on which the motion turns by the golden share (3 - sqrt 5)/2 of a
 full turn a return is drawn black: of all curves around it, it should be among the last to break.
-The last picture shows the rotation number against the momentum where the curves cross theta2 = 0.
+The last picture shows the rotation number against the momentum where the curves cross theta2 = 0;
+steps are chains of islands, where it is a fraction.
 
 The script prints the rotation number of the golden curve by two methods, and how far the periodic
 orbits of one return are from what `find_orbit` or, integrated over a period, diffrax gives.
@@ -101,6 +102,7 @@ def draw_rotations(golden: dict[float, Any], ax: Any) -> None:
     ax.set_xlabel("p2 at theta2 = 0 (kg m$^2$/s)")
     ax.set_ylabel("rotation number (turns a return)")
     ax.set_title("around the anti-phase orbit", fontsize="medium")
+    ax.locator_params(axis="x", nbins=6)
     ax.legend(frameon=False, fontsize="small", loc="lower right")
 
 
