@@ -15,7 +15,6 @@ from dpend.checks import instance, integer, one_of, shown, single
 from dpend.inverse.fit import Fit
 from dpend.map_picture import LABELS, draw_map
 from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
-from dpend.motion.simulate import simulate
 from dpend.motion.trajectory import Trajectory
 from dpend.orbits.family import Family
 from dpend.orbits.orbit import PeriodicOrbit
@@ -159,16 +158,9 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
     steps = 20 * (_STROBES - 1)  # over half a period, so that the strobes fall on both rests
     for (name, orbit), row in zip(orbits.items(), grid, strict=True):
         period = float(orbit.period)
-        whole = simulate(
-            orbit.pendulum, orbit.state, period, step=period / (2 * steps), error=False
-        )
-        half = Trajectory(
-            whole.time[: steps + 1],
-            jax.tree.map(lambda leaf: leaf[: steps + 1], whole.state),
-            whole.energy_drift, whole.error_estimate, whole.steps, whole.status, whole.scheme,
-            method=whole.method,
-        )  # fmt: skip
-        strobe(orbit.pendulum, half, row[0], every=20)
+        times = np.linspace(0.0, period, 2 * steps + 1)
+        whole = orbit.trajectory(times)
+        strobe(orbit.pendulum, orbit.trajectory(times[: steps + 1]), row[0], every=20)
         path(whole, row[1])
         angles(whole, row[2])
         row[0].set_title(f"{name}, {period / (2 * (_STROBES - 1)):.3f} s apart", fontsize="medium")

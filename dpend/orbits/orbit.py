@@ -10,9 +10,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from dpend.checks import Scalar, known_value
+from dpend.checks import Scalar, known_value, shown
 from dpend.mechanics.pendulum import Pendulum, State
 from dpend.mechanics.units import natural
+from dpend.motion.trajectory import TOLERANCE, Trajectory
 from dpend.orbits.arc import PARTS, state_halfway
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.implicit import (
@@ -27,6 +28,7 @@ from dpend.orbits.implicit import (
     piece_equations,
 )
 from dpend.orbits.newton import Solved
+from dpend.orbits.path import unfold
 from dpend.orbits.single import FINE, Line, clock, rate_along, steps_for
 from dpend.orbits.stability import OPPOSITE, stability_class
 from dpend.status import Status
@@ -98,6 +100,38 @@ class PeriodicOrbit:
     def stability(self) -> str:
         """`elliptic`, `hyperbolic` or `inverse hyperbolic`, of a single orbit."""
         return stability_class(float(self.kappa))
+
+    def trajectory(
+        self, times: Any | None = None, *, tolerance: float | Any = TOLERANCE
+    ) -> Trajectory:
+        """The motion of a single orbit at `times`, any number of periods on or back.
+
+        It never parts from the orbit, however unstable that is: it starts anew from the states at
+        t = 0 and T/2, and each piece lasts a quarter of the period.
+
+        Arguments:
+            times: [s], shape (n,), in any order; by default 301 over one period, whose last state
+                is the first (up to full turns).
+            tolerance: wanted error of the angles in a quarter of the period [rad], the orbit's
+                states and period taken as they are.
+        Returns:
+            Trajectory of NumPy arrays. Its status is that of the first piece that failed.
+        Raises:
+            ValueError: many orbits, or one that was not found; times not finite; tolerance not
+                positive.
+        """
+        if np.ndim(self.period) or not np.isfinite(period := float(self.period)):
+            raise ValueError(
+                f"orbit must be a single one that was found, got a period of "
+                f"{shown(self.period)}: take one of them"
+            )
+        pendulum, *starts = (
+            jax.tree.map(float, each) for each in (self.pendulum, self.state, self.dual)
+        )
+        # Of a centred orbit `turns` tells of the quarter; it comes back without any.
+        moving = self.symmetry in ("passing", "none")
+        turns = [int(turn) * moving for turn in self.turns]
+        return unfold(pendulum, (starts[0], starts[1]), period, turns, times, tolerance)
 
 
 def mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
