@@ -27,6 +27,7 @@ from dpend.machine import configure as configure
 from dpend.maps.periodic import periodic_points as periodic_points
 from dpend.maps.returns import Return as Return
 from dpend.maps.returns import return_map as return_map
+from dpend.maps.rotation import rotation_numbers as rotation_numbers
 from dpend.maps.section import section as section
 from dpend.maps.store import StoreWarning as StoreWarning
 from dpend.maps.sweep import sweep as sweep

@@ -268,8 +268,8 @@ def section(dataset: Any, ax: "Axes | Any | None" = None, *, periodic: Any | Non
 
     Arguments:
         dataset: what `section` returned.
-        periodic: what `periodic_points` returned on the same plane: rings where |kappa| <= 1,
-            crosses where the orbit is unstable.
+        periodic: what `periodic_points` returned on the same plane, or a list of such: rings where
+            |kappa| <= 1, crosses where the orbit is unstable.
     Raises:
         ValueError: other datasets.
     """
@@ -277,14 +277,16 @@ def section(dataset: Any, ax: "Axes | Any | None" = None, *, periodic: Any | Non
 
     instance("dataset", dataset, xarray.Dataset, "what dpend.section returns")
     _check_variables("dataset", dataset, ("angle", "momentum", "side"), "dpend.section")
-    if periodic is not None:
-        instance("periodic", periodic, xarray.Dataset, "what dpend.periodic_points returns")
+    several = periodic if isinstance(periodic, (list, tuple)) else [periodic]
+    marked = [] if periodic is None else several
+    for one in marked:
+        instance("periodic", one, xarray.Dataset, "what dpend.periodic_points returns")
         names = ("angle", "momentum", "kappa")
-        _check_variables("periodic", periodic, names, "dpend.periodic_points")
+        _check_variables("periodic", one, names, "dpend.periodic_points")
     ax = _axes(ax)
     draw_section(ax, dataset)
-    if periodic is not None:
-        draw_periodic(ax, periodic)
+    for one in marked:
+        draw_periodic(ax, one)
     return ax
 
 

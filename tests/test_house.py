@@ -24,7 +24,7 @@ motion.stepped motion.tables motion.simulate motion.reference motion.root motion
 motion.crossings motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
-maps.section maps.returns maps.periodic
+maps.section maps.returns maps.periodic maps.rotation
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.path orbits.orbit orbits.samples orbits.zones
 orbits.special orbits.passages orbits.through orbits.find orbits.family orbits.branching
