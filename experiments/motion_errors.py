@@ -148,7 +148,8 @@ def main() -> None:
     refused = [v for v in verdicts if not v.passed]
     wrong = sum(v.error > v.tolerance for v in passed)
     right = sum(v.error <= v.tolerance for v in refused)
-    sys.exit(wrong > len(passed) / 100 or right > len(refused) / 5)
+    # Of a few motions one or two may be so by chance.
+    sys.exit(int(wrong > max(1, len(passed) / 100) or right > max(2, len(refused) / 5)))
 
 
 if __name__ == "__main__":
