@@ -50,11 +50,20 @@ def run_kept(function: Any, arguments: tuple, static: tuple = ()) -> Any:
     if key not in _loaded:
         path = _folder / f"{key}.executable"
         program = _read(path, key)
-        if program is None:
+        if program is None or not _runs(program, arguments):
             program = _compile(function, arguments, static)
             _write(path, key, program)
         _loaded[key] = program
     return _loaded[key](*arguments)
+
+
+def _runs(program: Callable[..., Any], arguments: tuple) -> bool:
+    """Whether a loaded program runs: XLA looks for some of its parts only then."""
+    try:
+        jax.block_until_ready(program(*arguments))
+    except Exception:
+        return False
+    return True
 
 
 def _compile(function: Any, arguments: tuple, static: tuple) -> Callable[..., Any]:
@@ -116,8 +125,9 @@ def _read(path: Path, key: str) -> Callable[..., Any] | None:
         # Lowering any factorisation has JAX register LAPACK with XLA; without it a loaded program
         # that calls LAPACK ends the process.
         jax.jit(jax.lax.linalg.lu).lower(jnp.zeros((1, 1)))
+        code, given, found = pickle.loads(body)
         return serialize_executable.deserialize_and_load(
-            *pickle.loads(body), execution_devices=[jax.devices()[0]]
+            code, given, found, execution_devices=[jax.devices()[0]]
         )
     except Exception:  # another layout of JAX's own: the program is traced as ever
         return None
