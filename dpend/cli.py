@@ -18,6 +18,7 @@ import typer
 
 from dpend import orbit_commands, section_commands, simulation_commands
 from dpend._runtime import catch_interrupts, leave_quietly, take_all_cores
+from dpend.executables import keep_executables
 from dpend.options import app
 from dpend.terminal import tell_error
 
@@ -40,6 +41,7 @@ def _keep_compiled_code() -> None:
         return
     if os.access(base, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(base))
+        keep_executables(base / "executables")
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 

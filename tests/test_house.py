@@ -16,7 +16,7 @@ import dpend
 # in its own wing.
 # The public names, `dpend` itself, come last but for the doors, which draw, print and serve.
 ORDER = """
-_version _runtime checks machine places status records
+_version _runtime checks machine executables places status records
 mechanics.trig mechanics.pendulum mechanics.surface mechanics.linear mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.nodes methods.collocation methods.scheme
 motion.integrate motion.estimate motion.trajectory motion.adaptive motion.variation motion.saved

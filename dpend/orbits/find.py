@@ -39,6 +39,7 @@ from dpend.checks import (
     shown,
     single,
 )
+from dpend.executables import run_kept
 from dpend.mechanics.pendulum import (
     Pendulum,
     State,
@@ -296,7 +297,8 @@ def find_orbit(
     theta1 = jnp.asarray(theta1, jnp.float64)
     if guess is None:
         slow = (branch or ("in-phase" if ratio == 1 else "anti-phase")) == "in-phase"
-        return _on_branch(pendulum, theta1, slow, (crossing, float(ratio or 0)), settings, error)
+        given = pendulum, theta1, slow, (crossing, float(ratio or 0)), settings
+        return run_kept(_on_branch, given, (error,))
     theta2, period = (jnp.asarray(value, jnp.float64) for value in _guess_of(guess))
     if ratio is None:
         directions, x = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), theta2
