@@ -29,6 +29,7 @@ from dpend.options import (
     command,
     counted,
     equations_of,
+    guess_in,
     names_in,
     numeric,
     radians,
@@ -76,7 +77,7 @@ def orbit(
     ] = None,
 ) -> Report:
     """The releases from rest at THETA1 that come back: partner angle, period, stability, error."""
-    guess = _guess(theta2, period)
+    guess = guess_in(theta2, period)
     if crossing is not None and branch is None:
         raise ValueError(
             f"crossing must go with branch, got {crossing} alone: give --branch "
@@ -100,18 +101,6 @@ def orbit(
     ]
     record = {"orbits": records} if both else records[0]
     return record, partial(print_orbits, pendulum, records), converged(*found.values())
-
-
-def _guess(theta2: float | None, period: float | None) -> tuple[float, float] | None:
-    """What the two options say together [rad, s]."""
-    if theta2 is None and period is None:
-        return None
-    if theta2 is None or period is None:
-        given, missing = ("theta2", "period") if period is None else ("period", "theta2")
-        raise ValueError(
-            f"{missing} must be given with {given}, got {given} alone: a guess is both"
-        )
-    return radians("theta2", theta2), number("period", period, positive=True, unit="s")
 
 
 @command()

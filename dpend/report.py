@@ -113,6 +113,10 @@ def converged(*results: Any) -> bool:
     return all(int(result.status) == Status.CONVERGED for result in results)
 
 
+def print_text(text: str) -> None:
+    print(text)
+
+
 def print_json(found: dict[str, Any]) -> None:
     print(json_text(found))
 

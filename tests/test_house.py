@@ -28,10 +28,13 @@ orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.cros
 orbits.find orbits.family orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey
+proofs.decimals proofs.balls proofs.taylor proofs.flow proofs.proof proofs.facts proofs.digits
+proofs.certificate proofs.certify proofs.ledger
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture plots animate report writing terminal options orbit_commands simulation_commands cli
+map_picture plots animate report writing terminal options orbit_commands proof_commands
+simulation_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
@@ -131,7 +134,8 @@ def test_import_leaves_heavy_packages_alone():
     code = """
 import sys, dpend, dpend.cli
 print(*sorted({name.split('.')[0] for name in sys.modules}
-              & {'diffrax', 'equinox', 'optax', 'xarray', 'zarr', 'pandas', 'matplotlib', 'dask'}))
+              & {'diffrax', 'equinox', 'optax', 'xarray', 'zarr', 'pandas', 'matplotlib', 'dask',
+                 'flint'}))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
