@@ -70,50 +70,13 @@ def monodromy(
     return transition(pendulum, state, step_size(period, steps), steps, scheme)[1]
 
 
-def half_from_quarter(quarter: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """Phi(T/2) of a centred orbit from Q = Phi(T/4): N Q^-1 N Q, the inverse being the symplectic
-    one.
-    """
-    a, b, c, d = _blocks(quarter)
-    back = jnp.block([[d.T, b.T], [c.T, a.T]])  # N Q^-1 N
-    return back @ quarter
-
-
-def half_trace(quarter: Float[Array, "4 4"]) -> Scalar:
-    """c = (tr(-Phi(T/2)) - 2)/2 of a centred orbit from Q = Phi(T/4); kappa = 2 c^2 - 1, stability
-    ends at c = 1.
-    """
-    a, _, _, d = _blocks(quarter)
-    return 1 - 2 * jnp.sum(a * d)
-
-
-def kappa_of_centred(quarter: Float[Array, "4 4"]) -> Scalar:
-    """kappa from Phi(T/4) of a centred orbit."""
-    return 2 * half_trace(quarter) ** 2 - 1
-
-
-def kappa_of_brake(half: Float[Array, "4 4"]) -> Scalar:
-    """kappa from Phi(T/2) of a brake orbit."""
-    _, b, c, _ = _blocks(half)
-    return 1 + 2 * jnp.sum(b * c)
-
-
-def kappa_of_odd(half: Float[Array, "4 4"]) -> Scalar:
-    """kappa from Phi(T/2) of an orbit with x(T/2) = -x(0)."""
-    return 2 * ((-jnp.trace(half) - 2) / 2) ** 2 - 1
-
-
-def kappa_of_monodromy(matrix: Float[Array, "4 4"]) -> Scalar:
-    """kappa from the derivative of the flow over a whole period: (tr M - 2)/2."""
-    return (jnp.trace(matrix) - 2) / 2
-
-
 def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, Any]:
     """c (NaN for brake orbits), kappa and log |kappa| from Phi over the shooting time, given as a
     product.
 
-    The same as `kappa_of_centred`, `kappa_of_brake` and `kappa_of_odd`, but that the product is
-    scaled as it grows: no kappa is too large for its logarithm.
+    With Phi = [[A, B], [C, D]] the product: kappa = 1 + 2 tr(B^T C) of brake orbits; of the others
+    kappa = 2 c^2 - 1, with c = (tr(-Phi) - 2)/2 of odd ones and c = 1 - 2 tr(A^T D) of centred
+    ones. The product is scaled as it grows: no kappa is too large for its logarithm.
 
     Arguments:
         matrices: of the consecutive segments of a quarter (centred) or half (brake, odd) of the
@@ -219,7 +182,3 @@ def stability_class(kappa: float | Any) -> str:
     if abs(kappa) < 1:
         return "elliptic"
     return "hyperbolic" if kappa > 1 else "inverse hyperbolic"
-
-
-def _blocks(matrix: Float[Array, "4 4"]) -> tuple[Array, Array, Array, Array]:
-    return matrix[:2, :2], matrix[:2, 2:], matrix[2:, :2], matrix[2:, 2:]

@@ -15,7 +15,7 @@ import dpend
 from dpend import Pendulum, Status
 from dpend.inverse.problem import PARAMETERS
 from dpend.orbits.orbit import slopes
-from dpend.orbits.stability import kappa_of_monodromy, transition
+from dpend.orbits.stability import transition
 
 SIXTY = np.radians(60)
 
@@ -65,7 +65,8 @@ def around(pendulum, state, period):
 
 
 def full_kappa(found):
-    return float(kappa_of_monodromy(around(found.pendulum, found.orbit.state, found.orbit.period)))
+    whole = around(found.pendulum, found.orbit.state, found.orbit.period)
+    return float(np.trace(whole) - 2) / 2
 
 
 def logs(found, start):
