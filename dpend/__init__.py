@@ -49,8 +49,8 @@ from dpend.motion.gradients import gradient_horizon as gradient_horizon
 from dpend.motion.integrate import flow as flow
 from dpend.motion.integrate import fold as fold
 from dpend.motion.reference import reference as reference
-from dpend.motion.simulate import Trajectory as Trajectory
 from dpend.motion.simulate import simulate as simulate
+from dpend.motion.trajectory import Trajectory as Trajectory
 from dpend.orbits.continuation import follow_family as follow_family
 from dpend.orbits.family import Family as Family
 from dpend.orbits.find import find_orbit as find_orbit

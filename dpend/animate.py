@@ -23,7 +23,8 @@ from dpend.mechanics.pendulum import (
     check_state,
     positions,
 )
-from dpend.motion.simulate import Trajectory, simulate
+from dpend.motion.simulate import simulate
+from dpend.motion.trajectory import Trajectory
 from dpend.places import check_place, file_path, replacing
 from dpend.plots import LOWER, UPPER
 

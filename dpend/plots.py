@@ -15,7 +15,8 @@ from dpend.checks import instance, integer, one_of, shown, single
 from dpend.inverse.fit import Fit
 from dpend.map_picture import LABELS, draw_map
 from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
-from dpend.motion.simulate import Trajectory, simulate
+from dpend.motion.simulate import simulate
+from dpend.motion.trajectory import Trajectory
 from dpend.orbits.family import Family
 from dpend.orbits.orbit import PeriodicOrbit
 
@@ -164,6 +165,7 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
             whole.time[: steps + 1],
             jax.tree.map(lambda leaf: leaf[: steps + 1], whole.state),
             whole.energy_drift, whole.error_estimate, whole.steps, whole.status, whole.scheme,
+            method=whole.method,
         )  # fmt: skip
         strobe(orbit.pendulum, half, row[0], every=20)
         path(whole, row[1])

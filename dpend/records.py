@@ -97,7 +97,7 @@ def columns(result: Any, names: str = "") -> dict[str, list[Any]]:
     return found
 
 
-def variables(result: Any, dim: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def variables(result: Any, dim: str | tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The fields of a result as xarray takes them, in SI over `dim`, and angles in degrees as
     coordinates beside.
     """

@@ -11,7 +11,7 @@ import numpy as np
 
 import dpend
 from dpend.mechanics.pendulum import Pendulum
-from dpend.motion.simulate import Trajectory
+from dpend.motion.trajectory import Trajectory
 from dpend.orbits.orbit import PeriodicOrbit
 from dpend.records import columns, json_text, record
 from dpend.status import Status
@@ -64,14 +64,13 @@ def family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
 
 
 def motion_record(motion: Trajectory) -> dict[str, Any]:
-    assert motion.scheme is not None
     end = jax.tree.map(lambda leaf: leaf[-1], motion.state)
     duration, steps = float(motion.time[-1]), int(motion.steps)
     return {
         "final": {**record(end, "theta1 theta2"), "p1": float(end.p1), "p2": float(end.p2)},
         "duration_s": duration,
         **record(motion, "energy_drift error_estimate steps"),
-        "method": motion.scheme.name,
+        "method": motion.method,
         "step_s": abs(duration) / steps,
         **record(motion, "status tolerance message"),
     }

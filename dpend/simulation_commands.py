@@ -72,9 +72,7 @@ def simulate(
     ] = 0.0,
     method: Annotated[
         str | None,
-        typer.Option(
-            help="rk4, rk8 (default for a step), gauss, rk4-circle or rk8-circle (for a tolerance)."
-        ),
+        typer.Option(help="With --step: rk4, rk8 (default), gauss, rk4-circle or rk8-circle."),
     ] = None,
     step: Annotated[float | None, numeric(help="Largest step [s].")] = None,
     tolerance: Annotated[

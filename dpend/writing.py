@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import dpend
-from dpend.motion.simulate import Trajectory
+from dpend.motion.trajectory import Trajectory
 from dpend.places import check_place, replacing
 from dpend.records import columns, json_text
 

@@ -443,18 +443,36 @@ DOORS = {
             "method": kind(
                 [*NO_CHOICES, "rk8-circle-rescaled"], ["rk4", np.str_("rk8")], none=True
             ),
-            "save_every": COUNT,
+            "save_every": kind(COUNT[0], COUNT[1], none=True),
             "most_steps": BUDGET,
             "error": FLAG,
             "tolerance": kind(POSITIVE[0][1:]),
         },
-        "dpend.motion.simulate._simulate",
+        "dpend.motion.stepped._simulate",
     ),
     "simulate, for a tolerance": Door(
         dpend.simulate,
         {"pendulum": PAPER, "state": RELEASE, "duration": 1.0},
-        {"tolerance": MAYBE_POSITIVE},
-        "dpend.motion.simulate.find_scheme",
+        {
+            "pendulum": PENDULUM,
+            "state": STATE,
+            "duration": kind([*NUMBER[0], 0, 0.0], HALVES),
+            "tolerance": MAYBE_POSITIVE,
+            "most_steps": BUDGET,
+        },
+        "dpend.motion.simulate.one_motion",
+    ),
+    "simulate, at times": Door(
+        dpend.simulate,
+        {"pendulum": PAPER, "state": RELEASE, "times": [1.0]},
+        {"times": kind(GRID[0][1:], GRID[1])},
+        "dpend.motion.simulate.one_motion",
+    ),
+    "simulate, at ends of steps": Door(
+        dpend.simulate,
+        {"pendulum": PAPER, "state": RELEASE, "duration": 1.0, "save_every": 2},
+        {"save_every": kind(COUNT[0][1:], COUNT[1]), "state": ONE_STATE},
+        "dpend.motion.simulate.motion_at_steps",
     ),
     "reference": Door(
         dpend.reference,
@@ -1036,11 +1054,13 @@ TRACEABLE = {
     *((name, "duration") for name in ("flow", "fold")),
     ("fold", "init"),
     ("reference", "tolerance"),
+    ("simulate, at times", "times"),
     ("multipliers", "kappa"),
     *(("find_orbit", name) for name in ("theta1", "turn", "tolerance", "max_iterations")),
 }
 DIFFERENTIABLE = TRACEABLE | {
     ("simulate", "duration"),
+    ("simulate, for a tolerance", "duration"),
     ("Family.at", "theta1"),
     ("stability_class", "kappa"),
 }

@@ -18,8 +18,9 @@ import dpend
 ORDER = """
 _version _runtime checks places status records
 mechanics.trig mechanics.pendulum mechanics.linear mechanics.units
-methods.runge_kutta methods.circle methods.gauss methods.scheme
-motion.integrate motion.estimate motion.simulate motion.reference motion.root motion.events
+methods.runge_kutta methods.circle methods.gauss methods.nodes methods.collocation methods.scheme
+motion.integrate motion.estimate motion.trajectory motion.adaptive motion.variation motion.saved
+motion.stepped motion.tables motion.simulate motion.reference motion.root motion.events
 motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
@@ -42,7 +43,7 @@ LAZY = {("dpend", "plots"), ("dpend", "animate")}
 # Sizes: lines of a file, lines of code and McCabe's complexity of a function. What is above them
 # says why in a comment beside it, or waits to be written anew.
 LONGEST_FILE, LONGEST_FUNCTION, MOST_BRANCHES = 350, 40, 12
-LONG_FILES = {"orbits/find.py", "orbits/special.py", "motion/simulate.py"}
+LONG_FILES = {"orbits/find.py", "orbits/special.py"}
 LONG_FUNCTIONS = {
     "map_command", "atlas", "orbit", "simulate", "fit",  # options, one a line
     "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation

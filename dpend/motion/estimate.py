@@ -2,7 +2,6 @@
 included; and the step that reaches a tolerance (`find_scheme`).
 """
 
-import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from dpend.checks import Scalar
 from dpend.mechanics.linear import fast_frequency
 from dpend.mechanics.pendulum import Pendulum, State, energy_scale, hamiltonian, vector_field
 from dpend.methods.scheme import Scheme
-from dpend.motion.integrate import Turns, march, step_size, without_turns
+from dpend.motion.integrate import Turns, march, without_turns
 
 EPS = float(np.finfo(float).eps)
 # Tangents go along a motion of this method, the only one that carries them at little more than its
@@ -44,18 +43,6 @@ NEAR_ROUNDING = 1e4
 # The share of a tolerance that the search for a step aims at: an estimate may itself be off by a
 # tenth.
 MARGIN = 0.8
-# The first step that is tried when one is sought [rad of the fastest motion at the start].
-_FIRST_TURN = 0.5
-# The next trial takes at least, and at most, so many times as many steps.
-_LEAST_MORE, _MOST_MORE = 1.2, 4.0
-# Below (rate dt)^p of this the truncation of a step is lost in rounding: a smaller step only adds
-# to that.
-_ONLY_ROUNDING = 1e-18
-# A motion that keeps its energy this well, in units of its scale, has steps that resolve it.
-_RESOLVED = 1e-10
-# What a rounding grows to is believed where two steps tell it within this factor: too long a step
-# makes growth of its own.
-_ALIKE = 10.0
 
 
 def fastest_rod(pendulum: Pendulum, state: State) -> Scalar:
@@ -208,66 +195,3 @@ def growth_along(tangents: State | None) -> Scalar:
         jnp.linalg.norm(tangents.theta1, axis=-1), jnp.linalg.norm(tangents.theta2, axis=-1)
     )
     return jnp.max(sizes)
-
-
-class _Trial(NamedTuple):
-    """What a trial of a step tells: the estimate of the error and the floor that rounding sets
-    [rad], the turn in a step [rad], and the drift of the energy.
-    """
-
-    error: float
-    floor: float
-    turn: float
-    drift: float
-
-    def settles(self, before: tuple[float, float], tolerance: float) -> bool:
-        """Whether no shorter step is worth a trial: the tolerance is reached, or rounding sets the
-        error.
-
-        Arguments:
-            before: the floor of the trial before, and the error that this one should have come
-                below.
-        """
-        near = self.error < PARTED  # to the true motion all along, or else at least to its energy
-        alike = before[0] / _ALIKE < self.floor < _ALIKE * before[0]
-        lost = alike and self.floor > tolerance and (near or self.drift < _RESOLVED)
-        steady = alike and near and self.error < NEAR_ROUNDING * self.floor
-        steady = steady and self.error > before[1]
-        return self.turn <= LARGEST_TURN and (self.error <= MARGIN * tolerance or lost or steady)
-
-
-def find_scheme(
-    pendulum: Pendulum,
-    state: State,
-    duration: float,
-    method: str,
-    tolerance: float,
-    most_steps: int,
-) -> tuple[Scheme, Comparison]:
-    """The method with a step at which the error of this motion is below `tolerance`, or as small as
-    rounding or `most_steps` allow, and what a second pass told of it.
-    """
-    rate = float(np.nan_to_num(fastest_of_all(pendulum, state), posinf=0.0))  # a status tells of it
-    steps = max(1, math.ceil(abs(duration) * rate / _FIRST_TURN))
-    if steps > most_steps:
-        raise ValueError(
-            f"duration must be at most some {_FIRST_TURN * most_steps / rate:.1e} s for a "
-            f"tolerance, got {duration:g}, "
-            f"which takes {steps:.3g} steps or more: give a shorter one, a step, or more most_steps"
-        )
-    order, best, before = Scheme(method, 1.0).order, None, (math.inf, math.inf)
-    while True:
-        scheme = Scheme(method, abs(duration) / steps)
-        dt, count = step_size(duration, steps), jnp.asarray(steps)
-        compared = compare(pendulum, state, dt, count, any_step(scheme))
-        error, floor, fastest, drift = (float(value) for value in compared[:4])
-        trial = _Trial(error, floor, float(scheme.step * np.fmax(rate, fastest)), drift)
-        if trial.turn <= LARGEST_TURN and not (best and best[0] < error):
-            best = error, scheme, compared
-        missing = (2 * error / tolerance) ** (1 / order) if math.isfinite(error) else _MOST_MORE
-        more = min(max(missing, trial.turn, _LEAST_MORE), _MOST_MORE)
-        steps = math.ceil(steps * more)
-        settled = trial.settles(before, tolerance)
-        if settled or trial.turn < _ONLY_ROUNDING ** (1 / order) or steps > most_steps:
-            return (best or (error, scheme, compared))[1:]
-        before = floor, error * more ** (-order / 2)

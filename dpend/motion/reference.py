@@ -6,11 +6,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import ArrayLike
 
 from dpend._runtime import require_float64
-from dpend.checks import Scalar, flag, integer, known_value, number, numbers, shown, single
+from dpend.checks import Scalar, flag, integer, known_value, number, single
 from dpend.mechanics.linear import fast_frequency
 from dpend.mechanics.pendulum import Pendulum, State, check_motion, vector_field
 from dpend.mechanics.trig import LARGEST_ANGLE
@@ -23,7 +22,7 @@ from dpend.motion.estimate import (
     growth_along,
 )
 from dpend.motion.integrate import float64
-from dpend.motion.simulate import Trajectory
+from dpend.motion.trajectory import Trajectory, check_times
 from dpend.status import Status
 
 # Steps, if nobody asks for more: at 20 microseconds each they take half a minute, as the most steps
@@ -83,7 +82,7 @@ def reference(
             f"{known:g}: "
             "give a larger tolerance"
         )
-    grid = jnp.asarray(_check_times(times))
+    grid = jnp.asarray(check_times(times))
     state = float64(state)
     roundings = count_roundings(state) if error else None
     states, growth, steps, done = _dopri8(pendulum, state, roundings, grid, tolerance, most_steps)
@@ -95,28 +94,7 @@ def reference(
     lost = jnp.where(steps < most_steps, Status.NONFINITE, Status.MAX_ITERATIONS)
     status = jnp.where(done, Status.CONVERGED, lost)
     drift = energy_drift(pendulum, with_start)
-    return Trajectory(grid, states, drift, estimate, steps, status)
-
-
-def _check_times(times: Any) -> np.ndarray:
-    """The times [s], if they move away from zero in one direction."""
-    grid = np.atleast_1d(numbers("times", times, unit="s"))
-    if grid.ndim != 1:
-        raise ValueError(
-            f"times must have one dimension, got shape {grid.shape}: give one number for each time"
-        )
-    moves = np.diff(grid, prepend=0.0)
-    ordered = (
-        np.all(moves[1:] > 0) and grid[0] >= 0
-        if grid.size and grid[-1] > 0
-        else np.all(moves[1:] < 0) and grid.size and grid[0] <= 0
-    )
-    if not grid.size or not np.all(np.isfinite(grid)) or not ordered:
-        raise ValueError(
-            f"times must be finite and move away from zero in one direction, got {shown(grid)}: "
-            f"sort them"
-        )
-    return grid
+    return Trajectory(grid, states, drift, estimate, steps, status, method="diffrax Dopri8")
 
 
 @partial(jax.jit, static_argnames="most_steps")
