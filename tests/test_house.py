@@ -45,7 +45,7 @@ LAZY = {("dpend", "plots"), ("dpend", "animate")}
 LONGEST_FILE, LONGEST_FUNCTION, MOST_BRANCHES = 350, 40, 12
 LONG_FILES = {"orbits/find.py", "orbits/special.py"}
 LONG_FUNCTIONS = {
-    "map_command", "atlas", "orbit", "simulate", "fit",  # options, one a line
+    "map_command", "atlas", "orbit", "simulate", "fit", "certify",  # options, one a line
     "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation
     "find_orbit", "check_gradient", "_dopri8",
 }  # fmt: skip

@@ -10,7 +10,7 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from dpend.checks import instance, integer, single
+from dpend.checks import at_most_one, instance, integer, known_number, one_of, single
 from dpend.mechanics.pendulum import Pendulum, known_pendulum
 from dpend.orbits.orbit import RELEASED_SYMMETRIES, PeriodicOrbit
 from dpend.proofs.certificate import Certificate, Question, Release
@@ -54,10 +54,10 @@ def certify(
         ValueError: no single orbit; a theta1_deg that is not the orbit's; digits out of range.
         RuntimeError: python-flint is missing.
     """
-    require_flint()
     instance("orbit", orbit, PeriodicOrbit, "dpend.find_orbit(pendulum, theta1, branch=...)")
     for name in ("theta1", "theta2", "period"):
         single(name, getattr(orbit, name))
+    wanted = None if digits is None else integer("digits", digits, least=1)
     pendulum = known_pendulum(orbit.pendulum)
     decimals = decimals_of(pendulum)
     centred = orbit.symmetry == "centred"
@@ -70,7 +70,7 @@ def certify(
             f"It is {orbit.symmetry}; only {' and '.join(RELEASED_SYMMETRIES)} orbits are covered."
         )
         return replace(_empty(question, Status.NOT_COVERED, reason), symmetry=orbit.symmetry)
-    wanted = None if digits is None else integer("digits", digits, least=1)
+    require_flint()
     return answer(question, wanted)
 
 
@@ -95,20 +95,28 @@ def require_flint() -> None:
 
 
 def _release(theta1: float, theta2: float, theta1_deg: Any, ratio: Any) -> Release:
+    at_most_one(theta1_deg=theta1_deg, ratio=ratio)
     if ratio is not None:
-        if ratio not in (1, -1) or abs(theta1 - ratio * theta2) > SAME_ANGLE * max(1, abs(theta1)):
+        sign = one_of("ratio", ratio, (1, -1))
+        if abs(theta1 - sign * theta2) > SAME_ANGLE * max(1, abs(theta1)):
             raise ValueError(
-                f"ratio must be 1 or -1, and the orbit on that line: got {ratio!r} for "
-                f"theta1 = {theta1} and theta2 = {theta2} rad; use dpend.find_orbit(..., ratio=1)"
+                f"ratio must be theta1/theta2 of the orbit, got {sign} for theta1 = {theta1} and "
+                f"theta2 = {theta2} rad: solve for it with dpend.find_orbit(..., ratio={sign})"
             )
-        return Release(shortest(theta1), "rad", ratio)
+        return Release(shortest(theta1), "rad", sign)
     if theta1_deg is None:
         return Release(shortest(theta1), "rad")
-    text = theta1_deg if isinstance(theta1_deg, str) else shortest(float(theta1_deg))
-    if abs(math.radians(parse_decimal(text)) - theta1) > SAME_ANGLE * max(1, abs(theta1)):
+    text = theta1_deg if isinstance(theta1_deg, str) else ""
+    if not text:
+        text = shortest(known_number("theta1_deg", theta1_deg, unit="deg"))
+    try:
+        off = abs(math.radians(parse_decimal(text)) - theta1)
+    except ValueError:
+        off = math.inf
+    if not off <= SAME_ANGLE * max(1, abs(theta1)):
         raise ValueError(
             f"theta1_deg must be the orbit's release angle, {math.degrees(theta1)!r} deg, got "
-            f"{text}; pass what the orbit was solved for"
+            f"{text!r:.60}: give what the orbit was solved for"
         )
     return Release(text, "deg")
 

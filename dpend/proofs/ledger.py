@@ -1,4 +1,4 @@
-"""`certify_atlas`: the rows of an atlas proved, on several cores, with a store that keeps all proofs.
+"""`certify_atlas`: the rows of an atlas proved, on several cores; a store keeps all proofs.
 
 The store is a file of JSON objects, one a line. A line is appended and flushed as soon as its proof
 ends, so that nothing computed is lost, however the process ends; a line that was cut off then is
@@ -70,8 +70,8 @@ def certify_atlas(
     workers = integer("processes", processes, least=1)
     if progress is not None:
         function("progress", progress, "(rows proved, rows)", "print")
-    require_flint()
     check_place("store", path, (".jsonl",))
+    require_flint()
     known = _read_store(path)
     questions = questions_of(atlas)
     names = [name_of(question, wanted) for question in questions]
