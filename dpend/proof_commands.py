@@ -37,7 +37,7 @@ def certify(
     atlas: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[ATLAS]", help="F.csv or F.json of dpend atlas: each of its rows is proved."
+            metavar="ATLAS", help="F.csv or F.json of dpend atlas: each of its rows is proved."
         ),
     ] = None,
     theta1: Annotated[

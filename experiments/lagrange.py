@@ -231,6 +231,8 @@ class Step(NamedTuple):
 
 
 def sure_step(pendulum: Pendulum, x: Any, h: Any, order: int, derivative: bool) -> Step:
+    if not bool(h > 0):
+        raise NoProof("a step does not go forwards")
     reach = float(h.upper()) * (1 + 1e-12)
     box = rough_box(pendulum, x, reach)
     if box is None:

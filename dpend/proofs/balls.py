@@ -21,6 +21,7 @@ numbers that are not negative, multiplied by a factor that covers their rounding
 """
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -52,8 +53,10 @@ def gamma(count: int) -> float:
 
 
 def upper(x: Any) -> float:
-    """A float that is not below |x| for any number of the ball x."""
-    return float(x.abs_upper()) * _ONE_ULP + 5e-324
+    """A float that is not below |x| for any number of the ball x; infinite for what is no number,
+    which comparisons and `max` would lose.
+    """
+    return float(x.abs_upper()) * _ONE_ULP + 5e-324 if x.is_finite() else math.inf
 
 
 def fraction_ball(x: Fraction) -> Any:

@@ -135,8 +135,9 @@ class Certificate:
         if self.release.ratio:
             start = "theta1 = " + ("theta2" if self.release.ratio == 1 else "-theta2")
         sentences = [
-            f"Released from rest at {start} and theta2 = {self.theta2_deg} deg, a pendulum with "
-            f"exactly {_values(self.pendulum)} moves periodically with the period {self.period} s.",
+            f"Proved: released from rest at {start} and a theta2 in {self.theta2_deg} deg, a "
+            f"pendulum with exactly {_values(self.pendulum)} moves periodically with a period in "
+            f"{self.period} s.",
             _TURNS[self.symmetry].format(*self.turns),
         ]
         if self.minimal:
@@ -144,10 +145,13 @@ class Certificate:
         if self.unique_period:
             sentences.append(
                 "There is no other such orbit with theta2 within "
-                f"{self.unique_theta2_deg} deg and the period within {self.unique_period} s."
+                f"{self.unique_theta2_deg} deg of it and the period within {self.unique_period} s."
             )
         return " ".join(
-            [*sentences, f"Its energy is {self.energy} J, kappa = {self.kappa}: {self.stability}."]
+            [
+                *sentences,
+                f"Its energy is in {self.energy} J, its kappa in {self.kappa}: {self.stability}.",
+            ]
         )
 
 

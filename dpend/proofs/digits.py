@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from flint import arb, arb_poly, arb_series
 
-from dpend.proofs.balls import field, precision, upper
+from dpend.proofs.balls import TINY, field, precision, upper
 from dpend.proofs.flow import COVER, Discs, cauchy_bounds, enclose, polynomial_defects
 from dpend.proofs.proof import (
     BITS,
@@ -33,8 +33,9 @@ from dpend.proofs.taylor import jacobian_series, motion_series, tangent_series
 # Digits beyond those wanted that Newton's method aims at; digits that a term of a series brings
 # (discs are as long as 16 digits need 30 terms); bits of a decimal digit, and some to spare.
 EXTRA, DIGITS_A_TERM, BITS_A_DIGIT, SPARE_BITS = 10, 16 / 30, 3.33, 40
-# Half width of the tubes about the rounded polynomials, and the most digits and passes.
-TUBE, MOST_DIGITS, PASSES = 1e-11, 1000, 120
+# Half width of the tubes about the rounded polynomials, and the most digits and passes: bounds are
+# float64 numbers, which end at 1e-308.
+TUBE, MOST_DIGITS, PASSES = 1e-11, 250, 120
 # A pass that gains less than this factor is the last.
 LEAST_GAIN = 0.1
 
@@ -133,10 +134,10 @@ class _Fine:
         """eta of every disc, the errors of the fixed parts of the states included."""
         problem, out = self.chain.problem, np.zeros(self.chain.index.shape)
         for i, rows in enumerate(self.rows):
-            # Floats of the coefficients, enlarged by more than their rounding; that of P(0) is
-            # inside the tube.
+            # Sizes of the coefficients, enlarged by more than their rounding and what is lost below
+            # the least normal number; the rounding of P(0) is inside the tube.
             floats = np.array([[float(x) for x in row] for row in rows]).T
-            floats[1:] *= 1 + 1e-15
+            floats[1:] = np.abs(floats[1:]) * (1 + 1e-15) + TINY
             tails, _ = cauchy_bounds(self.pendulum, floats, TUBE, terms)
             slopes = field(self.pendulum, [arb_series(row) for row in rows])
             step = self.duration * self.half[i]
@@ -209,7 +210,8 @@ def _prove_fine(fine: _Fine, terms: int, bits: int, digits: int) -> Digits:
         raise NoProof("the operator does not map any box at high precision into itself")
     late = upper(fine.duration - arb(discs.duration)) + float(radii[1])
     # Once for the rounding itself, twice for the excursion, which was bounded without it.
-    space = tube - 3 * distance * COVER
+    share = 2 * tubes.growth * (late / discs.duration) * COVER
+    space = tube - distance * (1 + share) * COVER
     if not exact.holds(chain.by_unknown(radii), late, discs.duration, space) or late >= TUBE:
         raise NoProof("the solutions from the box leave the tubes")
     theta2 = fine.rows[0][1][0] + arb(0, float(radii[0]))

@@ -246,6 +246,9 @@ def enclose(
     Raises:
         ArithmeticError: no bound is found; the tubes are too wide, or the discs too long.
     """
+    if not ((discs.half > 0).all() and discs.duration > 0):
+        # Gronwall's bound below is one for steps that are positive.
+        raise ArithmeticError("the discs do not lie in order")
     found = []
     for i, half in enumerate(discs.half):
         step = arb(discs.duration) * arb(float(half))

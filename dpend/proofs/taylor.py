@@ -194,7 +194,7 @@ def _edges(times: Any, reaches: Any, duration: float) -> list[float]:
     def at(t: float) -> float:
         return float(np.interp(t, times, reaches))
 
-    edges = [at(0.0)]
+    edges = [min(at(0.0), duration / 2)]
     while True:
         t, h = edges[-1], at(edges[-1])
         for _ in range(8):

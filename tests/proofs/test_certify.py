@@ -170,7 +170,7 @@ def test_bad_input_is_refused_at_the_door():
     orbit = dpend.find_orbit(PAPER, math.radians(40), branch="in-phase")
     with pytest.raises(ValueError, match="theta1_deg must be the orbit's release angle, 40"):
         certify(orbit, theta1_deg="41")
-    with pytest.raises(ValueError, match="ratio must be 1 or -1"):
+    with pytest.raises(ValueError, match="ratio must be theta1/theta2 of the orbit, got 1"):
         certify(orbit, ratio=1)
     with pytest.raises(ValueError, match="orbit must be"):
         certify(3)
