@@ -1,30 +1,35 @@
-"""Proofs of the paper's six motions, the eight brake orbits at 40 degrees, and rows of the atlas.
+"""The theorem of the paper's six motions and of the eight brake orbits at 40 degrees, in one page.
 
-`--rows N` proves N rows of the atlas spread evenly over it (0: all), `--out F.json` writes the
-certificates, and a second run goes on where the first one stopped. The table says what was proved,
-in how long, and what was not and why.
+It proves each to fifty digits (`dpend.certify`), prints what is proved in words and in how long,
+and writes the certificates to certificates.json. `--rows N` proves N rows of the atlas instead,
+spread evenly over it (`dpend certify` proves all), and prints the table only.
 
 Why we trust it: check_certificates.py proves each certificate again by other means.
 """
 
 import argparse
 import collections
-import csv
 import json
 import math
 import statistics
-import time
+import textwrap
 from pathlib import Path
 
 import numpy as np
 
+import dpend
 from dpend.proofs.certificate import Certificate, Question, Release
-from dpend.proofs.certify import answer
+from dpend.proofs.certify import answer, require_flint
+from dpend.proofs.ledger import questions_of
 
 HERE = Path(__file__).parent
 ATLAS = HERE / "atlas" / "brake_orbits.csv"
+CERTIFICATES = HERE / "certificates.json"
 PAPER = ("0.2", "0.2", "0.1", "0.1", "9.8")
-# Release [deg], partner [deg], period [s] as float64 solves them (numerics.md, paper.md).
+# The digits of the page, and its width.
+DIGITS, WIDTH = 50, 100
+# Release [deg], partner [deg], period [s] of the paper's six motions as `dpend.find_orbit` solves
+# them.
 SIX = {
     "A": ("64.3", 64.323444982221, 1.2553491280938),
     "B": ("40", 49.066544773743, 1.2127563331460),
@@ -33,8 +38,8 @@ SIX = {
     "E": ("40", -51.139513966294, 0.7544188658525),
     "F": ("10", -14.080998145069, 0.5119227306883),
 }
-# theta2 [deg], period [s] and turns of the eight at 40 degrees with a period up to 2 s (numerics.md
-# section 4); `None` for those that are not centred.
+# theta2 [deg], period [s] and turns of the eight at 40 degrees with a period up to 2 s, as
+# `dpend.find_brake_orbits` finds them; `None` for those that are not centred.
 EIGHT = (
     (-51.139513966, 0.754418866, (0, 0)),
     (-157.229758666, 0.789605931, (0, -1)),
@@ -45,22 +50,6 @@ EIGHT = (
     (-151.107616659, 1.923779041, None),
     (-152.332774219, 1.970160641, None),
 )
-
-
-def question_of(row: dict[str, str], pendulum: tuple[str, ...]) -> Question:
-    """A row of the atlas: its release angle is the decimal of degrees that is printed."""
-    turns = (int(row["turns1"]), int(row["turns2"])) if row["symmetry"] == "centred" else None
-    theta2, period = math.radians(float(row["theta2_deg"])), float(row["period_s"])
-    return Question(pendulum, Release(row["theta1_deg"], "deg"), theta2, period, turns)
-
-
-def rows_of(path: Path, count: int) -> list[Question]:
-    with path.open(newline="") as file:
-        about = json.loads(file.readline().removeprefix("#"))["pendulum"]
-        rows = list(csv.DictReader(file))
-    pendulum = tuple(repr(about[key]) for key in ("l1_m", "l2_m", "m1_kg", "m2_kg", "g_m_s2"))
-    chosen = np.linspace(0, len(rows) - 1, count or len(rows)).round().astype(int)
-    return [question_of(rows[i], pendulum) for i in chosen]
 
 
 def six() -> list[Question]:
@@ -77,61 +66,55 @@ def eight() -> list[Question]:
     ]
 
 
-def name_of(question: Question) -> str:
-    return f"{question.release.text} {math.degrees(question.theta2):.9f} {question.period:.9f}"
+def distinct(questions: list[Question]) -> list[Question]:
+    """Without those that are there already: B and E are released at 40 degrees too."""
+    found = {(one.release, round(one.theta2, 6)): one for one in reversed(questions)}
+    return list(found.values())[::-1]
 
 
-def prove_all(questions: list[Question], digits: int | None, out: Path | None) -> list[Certificate]:
-    """Certificates in order; those in the file `out` already are not proved again."""
-    done = json.loads(out.read_text()) if out is not None and out.exists() else {}
-    found = []
-    for number, question in enumerate(questions):
-        if name_of(question) in done:
-            continue
-        certificate = answer(question, digits)
-        found.append(certificate)
-        done[name_of(question)] = certificate.record()
-        if not certificate.exists or not certificate.minimal:
-            print(name_of(question), certificate.statement(), flush=True)
-        if out is not None and (number % 50 == 49 or number == len(questions) - 1):
-            out.write_text(json.dumps(done, indent=0))
-    return found
+def sample(count: int) -> list[Question]:
+    questions = questions_of(dpend.load_atlas(ATLAS))
+    chosen = np.linspace(0, len(questions) - 1, min(count, len(questions))).round().astype(int)
+    return [questions[i] for i in chosen]
 
 
-def report(found: list[Certificate], wall: float) -> None:
+def print_table(found: list[Certificate]) -> None:
     seconds = [certificate.seconds for certificate in found]
-    print(dict(collections.Counter(c.status.name.lower() for c in found)), end=" ")
-    print(dict(collections.Counter(c.stability for c in found)), end=" ")
-    print(f"minimal {sum(c.minimal for c in found)}", end=" ")
-    print(f"unique {sum(bool(c.unique_period) for c in found)} of {len(found)}")
+    kinds = collections.Counter(one.stability for one in found if one.exists)
     print(
-        f"CPU {sum(seconds):.1f} s, median {statistics.median(seconds):.3f}, at most "
-        f"{max(seconds):.3f}; wall {wall:.1f} s; discs at most {max(c.discs for c in found)}"
+        f"{sum(one.status == dpend.Status.PROVED for one in found)} of {len(found)} proved, "
+        f"{sum(one.minimal for one in found)} periods minimal, "
+        f"{sum(bool(one.unique_period) for one in found)} the only orbit nearby; "
+        + ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
     )
-    for certificate in found:
-        if certificate.stability == "not decided":
-            print("not decided:", certificate.release.text, certificate.kappa)
+    print(
+        f"CPU {sum(seconds):.1f} s, {statistics.median(seconds):.2f} s in the median, "
+        f"{max(seconds):.2f} s at most; {max(one.discs for one in found)} discs at most"
+    )
+    for one in found:
+        if one.status != dpend.Status.PROVED or one.stability == "not decided":
+            print("-", one.statement())
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--atlas", type=Path, default=ATLAS, metavar="F.csv")
-    parser.add_argument("--rows", type=int, default=50)
-    parser.add_argument("--set", choices=("six", "eight", "rows"), default="six")
-    parser.add_argument("--digits", type=int)
-    parser.add_argument("--out", type=Path, metavar="F.json")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rows", type=int, help="so many rows of the atlas instead")
+    parser.add_argument("--quick", action="store_true", help="two orbits, and no file")
     options = parser.parse_args()
-    sets = {"six": six, "eight": eight, "rows": lambda: rows_of(options.atlas, options.rows)}
-    questions = sets[options.set]()
-    started = time.perf_counter()
-    found = prove_all(questions, options.digits, options.out)
-    if not found:
-        print("all proved already")
+    try:
+        require_flint()
+    except RuntimeError as error:
+        parser.exit(2, f"{parser.prog}: {error}\n")
+    if options.rows:
+        print_table([answer(question) for question in sample(options.rows)])
         return
-    if options.set != "rows":
-        for certificate in found:
-            print(certificate.statement())
-    report(found, time.perf_counter() - started)
+    questions = six()[:2] if options.quick else distinct([*six(), *eight()])
+    found = [answer(question, DIGITS) for question in questions]
+    for number, certificate in enumerate(found, 1):
+        print(f"{number}.", textwrap.fill(certificate.statement(), WIDTH), end="\n\n")
+    print_table(found)
+    if not options.quick:
+        CERTIFICATES.write_text(json.dumps([one.record() for one in found], indent=1) + "\n")
 
 
 if __name__ == "__main__":

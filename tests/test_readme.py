@@ -158,6 +158,8 @@ def test_every_experiment_runs(tmp_path, script):
     shutil.copy(README, tmp_path)
     if re.search(r"^import heyoka", (place / script).read_text(), re.MULTILINE):
         pytest.importorskip("heyoka")
+    if re.search(r"^from (flint|dpend\.proofs)", (place / script).read_text(), re.MULTILINE):
+        pytest.importorskip("flint")
     command = [sys.executable, place / script, "--quick"]
     environment = {"PYTHONPATH": str(HOUSE), "MPLBACKEND": "Agg"}
     done = subprocess.run(
