@@ -16,9 +16,9 @@ from flint import arb, arb_mat, arb_series, ctx, fmpq
 
 # The longest step [sqrt(l1/g)].
 LONGEST_STEP = 0.25
-# A step is shorter by this than what its last two terms allow, and again by SHORTER until an
-# a-priori box is found and narrower than WIDEST.
-SHARE, SHORTER, WIDEST = 0.85, 0.8, 0.3
+# A step is shorter than what its last two terms allow, and again by SHORTER until an a-priori box
+# is found and narrower than WIDEST.
+SHORTER, WIDEST = 0.8, 0.3
 
 
 class NoProof(ArithmeticError):
@@ -253,11 +253,15 @@ def middle_of(x: Any) -> list[Any]:
 
 
 def plan_steps(
-    pendulum: Pendulum, x: Any, duration: float, order: int, exponent: float
+    pendulum: Pendulum, x: Any, duration: float, order: int, wish: tuple[float, float]
 ) -> tuple[list[float], list[Any]]:
     """A march without proof: exact lengths of all steps but the last, and where the steps begin;
     the last terms are below 10^exponent.
+
+    Arguments:
+        wish: the exponent, and the share of the step that it allows which is gone.
     """
+    exponent, share = wish
     lengths: list[float] = []
     states, t = [x], 0.0
     while True:
@@ -265,7 +269,7 @@ def plan_steps(
         h = LONGEST_STEP
         for n in (order - 1, order):
             size = max(float(abs(y[n]).mid()) for y in state)
-            h = min(h, SHARE * 10 ** ((exponent - math.log10(size + 1e-300)) / n))
+            h = min(h, share * 10 ** ((exponent - math.log10(size + 1e-300)) / n))
         while True:
             box = rough_box(pendulum, x, h)
             if box is not None and max(float(y.rad()) for y in box) < WIDEST:

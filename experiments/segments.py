@@ -186,12 +186,12 @@ def newton(chain: Chain, unknowns: Unknowns, size: Any) -> tuple[Unknowns, Any]:
     return unknowns, inverse
 
 
-def prove(release: Release, theta2: Any, duration: Any, goal: int) -> Orbit:
-    """Krawczyk's operator on a box of half width 10^-goal."""
+def prove(release: Release, theta2: Any, duration: Any, goal: int, share: float) -> Orbit:
+    """Krawczyk's operator on a box of half width 10^-goal; `share` as in `plan_steps`."""
     size, finest = arb(10) ** -goal, goal + SPARE_DIGITS - 4
     order = int(ORDER_A_DIGIT * goal)
     start = middle_of(release.state(theta2))
-    lengths, states = plan_steps(release.pendulum, start, float(duration), order, -finest)
+    lengths, states = plan_steps(release.pendulum, start, float(duration), order, (-finest, share))
     cuts = range(0, len(states), SEGMENT)
     chain = Chain(release, [lengths[i : i + SEGMENT] for i in cuts], order)
     unknowns = Unknowns(theta2, [states[i] for i in cuts][1:], duration)
