@@ -3,8 +3,10 @@
 A certificate says, of a pendulum without friction whose parameters are exactly the decimals given:
 released from rest at theta1, exactly the number given, and at a theta2 in the interval given, the
 motion is periodic, its period is in the interval given, and so on. It assumes that python-flint,
-NumPy's float64 sums and products (round to nearest, any order of summation) and this code do what
-they say; `experiments/check_certificates.py` proves the same again by other means.
+NumPy's float64 sums and products (round to nearest, any order of summation, no Strassen) and this
+code do what they say; `experiments/check_certificates.py` proves the same again by other means, but
+not how far the orbit is the only one. Elliptic and hyperbolic are said of the linear equations
+about the orbit. A certificate speaks of one orbit, not of whether others are missing from a list.
 """
 
 import hashlib

@@ -191,6 +191,14 @@ def test_tube_that_is_too_wide_is_refused():
         tubes_of(PAPER, [[1.0, -0.5, 3.0, 2.0]], [2.0], 1.0)
 
 
+def test_discs_out_of_order_and_bounds_that_are_no_numbers_are_refused():
+    """A bound that is NaN would be lost in a maximum; Gronwall's bound asks for steps forwards."""
+    assert upper(arb("nan")) == upper(1 / arb(0)) == math.inf
+    for half in ([-0.1], [0.0]):
+        with pytest.raises(ArithmeticError, match="order"):
+            tubes_of(PAPER, [[1.0, -0.5, 0.3, 0.2]], half, 1e-9)
+
+
 def test_precision_returns():
     before = flint.ctx.prec, flint.ctx.cap
     with precision(777, 33):
