@@ -73,7 +73,7 @@ def certify(
     """Proves releases from rest that come back: that they exist, their digits, period, stability.
     Of THETA1, or of each row of ATLAS.
     """
-    require_flint()
+    _check_flint()
     if (atlas is None) == (theta1 is None):
         raise ValueError(
             f"theta1 or an atlas must be given, got {'neither' if atlas is None else 'both'}: give "
@@ -93,6 +93,14 @@ def certify(
         found = [dpend.certify(one, theta1_deg=text, digits=wanted) for one in orbits]
     words = "\n\n".join(textwrap.fill(one.statement(), _WIDTH) for one in found)
     return _record(found), partial(print_text, words), _proved(found)
+
+
+def _check_flint() -> None:
+    """Without it the command line was asked for what it cannot do: status 2."""
+    try:
+        require_flint()
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
 
 
 def _refuse(given: str, **options: Any) -> None:
