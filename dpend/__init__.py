@@ -71,6 +71,9 @@ from dpend.orbits.samples import SpecialPoint as SpecialPoint
 from dpend.orbits.stability import monodromy as monodromy
 from dpend.orbits.stability import multipliers as multipliers
 from dpend.orbits.stability import stability_class as stability_class
+from dpend.proofs.certificate import Certificate as Certificate
+from dpend.proofs.certify import certify as certify
+from dpend.proofs.ledger import certify_atlas as certify_atlas
 from dpend.status import Status as Status
 from dpend.status import message as message
 

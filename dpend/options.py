@@ -161,6 +161,18 @@ def radians(name: str, degrees: float) -> float:
     return math.radians(number(name, degrees, unit="deg"))
 
 
+def guess_in(theta2: float | None, period: float | None) -> tuple[float, float] | None:
+    """What the two options say together [rad, s]."""
+    if theta2 is None and period is None:
+        return None
+    if theta2 is None or period is None:
+        given, missing = ("theta2", "period") if period is None else ("period", "theta2")
+        raise ValueError(
+            f"{missing} must be given with {given}, got {given} alone: a guess is both"
+        )
+    return radians("theta2", theta2), number("period", period, positive=True, unit="s")
+
+
 def _check_wish(branch: str | None, of_one: bool, of_both: bool) -> None:
     """Refuses a wish for no branch, and a branch without a wish for it."""
     names = f"{' or '.join(BRANCHES)}"

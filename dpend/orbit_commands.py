@@ -30,6 +30,7 @@ from dpend.options import (
     command,
     counted,
     equations_of,
+    guess_in,
     names_in,
     numeric,
     radians,
@@ -95,7 +96,7 @@ def orbit(
     the orbit near any motion.
     """
     formats = _formats(out, {".json": write_json})
-    guess, release = _guess(theta2, period), radians("theta1", theta1)
+    guess, release = guess_in(theta2, period), radians("theta1", theta1)
     if crossing is not None and branch is None:
         raise ValueError(
             f"crossing must go with branch, got {crossing} alone: give --branch "
@@ -119,18 +120,6 @@ def orbit(
     record = {"orbits": records} if both else records[0]
     _write(record, out, formats)
     return record, partial(print_orbits, pendulum, records, out), converged(*found.values())
-
-
-def _guess(theta2: float | None, period: float | None) -> tuple[float, float] | None:
-    """What the two options say together [rad, s]."""
-    if theta2 is None and period is None:
-        return None
-    if theta2 is None or period is None:
-        given, missing = ("theta2", "period") if period is None else ("period", "theta2")
-        raise ValueError(
-            f"{missing} must be given with {given}, got {given} alone: a guess is both"
-        )
-    return radians("theta2", theta2), number("period", period, positive=True, unit="s")
 
 
 def _near(

@@ -115,6 +115,10 @@ def converged(*results: Any) -> bool:
     return all(int(result.status) == Status.CONVERGED for result in results)
 
 
+def print_text(text: str) -> None:
+    print(text)
+
+
 def print_json(found: dict[str, Any]) -> None:
     print(json_text(found))
 
@@ -303,9 +307,8 @@ def print_motion(found: dict[str, Any], times: int, out: Path | None) -> None:
     print(f"                p1 = {final['p1']:.12g}, p2 = {final['p2']:.12g} kg m^2/s")
     drift = f"{found['energy_drift']:.1e} of its scale"
     print(f"error estimate  {found['error_estimate']:.1e} rad, energy drift {drift}")
-    mean = " in the mean" if found["method"] == "collocation" else ""
-    step = f"{found['steps']} steps of {found['step_s']:.4g} s{mean}"
-    print(f"integrated by   {found['method']}, {step}")
+    of = "of about" if found["method"] == "collocation" else "of"
+    print(f"integrated by   {found['method']}, {found['steps']} steps {of} {found['step_s']:.4g} s")
     _print_failure(found)
     if out is not None:
         print(f"written to      {out}: {times} times")

@@ -78,6 +78,21 @@ class Status(IntEnum):
         "of rounding alone have not grown so far; ask for less, or use a smaller step while that "
         "still helps.",
     )
+    PROVED = 20, "Proved."
+    NOT_PROVED = 21, "No proof was found; the orbit may exist all the same."
+    ANOTHER_ORBIT = (
+        22,
+        "An orbit was proved, but it is not the one that was asked about; solve for it again.",
+    )
+    NOT_COVERED = (
+        23,
+        "Orbits of this kind cannot be proved yet: those released from rest can, with gravity "
+        "downwards.",
+    )
+    DIGITS_NOT_PROVED = (
+        24,
+        "The orbit is proved, but not to as many digits as were asked for; ask for fewer.",
+    )
     NOT_COMPUTED = 255, "Not computed."
 
 

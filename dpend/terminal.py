@@ -30,12 +30,14 @@ def tell_cost(steps: int | float, seconds: float, size: int | float = 0, more: s
     """Says before it begins what takes more than a minute, or more than a gigabyte of `size`
     [bytes].
     """
+    tell_wait(f"about {steps:.1e} time steps", seconds, size, more)
+
+
+def tell_wait(what: str, seconds: float, size: int | float = 0, more: str = "") -> None:
+    """The same of any work."""
     if seconds > _LONG or size > _LARGE:
         room = f" and {size / 1e9:.2g} GB" if size > _LARGE else ""
-        complain(
-            f"about {steps:.1e} time steps, which may take {math.ceil(seconds / 60)} "
-            f"minutes{room}{more}"
-        )
+        complain(f"{what}, which may take {math.ceil(seconds / 60)} minutes{room}{more}")
 
 
 @contextlib.contextmanager

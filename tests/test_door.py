@@ -795,6 +795,47 @@ DOORS = {
     "load_atlas": Door(
         dpend.load_atlas, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}
     ),
+    "certify": Door(
+        dpend.certify,
+        {"orbit": ORBIT},
+        {
+            "orbit": kind([None, RELEASE, PAPER, *NO_OBJECTS], [ORBIT]),
+            "theta1_deg": kind(
+                [
+                    "",
+                    "x",
+                    "41",
+                    "1e999",
+                    "28.64_7",
+                    0.5,
+                    True,
+                    1j,
+                    [],
+                    {},
+                    object(),
+                    math.nan,
+                    HUGE,
+                ],
+                [math.degrees(0.5), str(math.degrees(0.5))],
+                none=True,
+            ),
+            "ratio": kind([*NO_INTEGERS, 0, 2, 1], none=True),
+            "digits": kind(COUNT[0], ONES, none=True),
+        },
+        "dpend.proofs.certify.require_flint",
+    ),
+    "certify_atlas": Door(
+        dpend.certify_atlas,
+        {"atlas": EMPTY, "store": str(Path(tempfile.gettempdir()) / "F.jsonl")},
+        {
+            "atlas": kind([None, ORBIT, *NO_OBJECTS], [EMPTY]),
+            "store": kind([*PATH[0], "F.txt", ".", "no/such/place/F.jsonl"]),
+            "digits": kind(COUNT[0], ONES, none=True),
+            "processes": COUNT,
+            "progress": PROGRESS,
+        },
+        "dpend.proofs.ledger.require_flint",
+    ),
     "load_angles": Door(dpend.load_angles, {}, {"path": PATH}),
     "Atlas.save": Door(EMPTY.save, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}),
     "Atlas.where": Door(

@@ -32,11 +32,13 @@ orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey
+proofs.decimals proofs.balls proofs.taylor proofs.flow proofs.proof proofs.facts proofs.digits
+proofs.certificate proofs.certify proofs.ledger
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
 map_picture section_picture plots animate tables report writing reading terminal options
-orbit_commands simulation_commands section_commands cli
+orbit_commands proof_commands simulation_commands section_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
@@ -46,7 +48,7 @@ LAZY = {("dpend", "plots"), ("dpend", "animate")}
 LONGEST_FILE, LONGEST_FUNCTION, MOST_BRANCHES = 350, 40, 12
 LONG_FILES = {"orbits/find.py", "orbits/special.py"}
 LONG_FUNCTIONS = {
-    "map_command", "atlas", "orbit", "simulate", "fit",  # options, one a line
+    "map_command", "atlas", "orbit", "simulate", "fit", "certify",  # options, one a line
     "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation
     "find_orbit", "check_gradient", "_dopri8",
 }  # fmt: skip
@@ -136,7 +138,8 @@ def test_import_leaves_heavy_packages_alone():
     code = """
 import sys, dpend, dpend.cli
 print(*sorted({name.split('.')[0] for name in sys.modules}
-              & {'diffrax', 'equinox', 'optax', 'xarray', 'zarr', 'pandas', 'matplotlib', 'dask'}))
+              & {'diffrax', 'equinox', 'optax', 'xarray', 'zarr', 'pandas', 'matplotlib', 'dask',
+                 'flint'}))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dpend.catalogue.files import read_catalogue
-from dpend.catalogue.table import UNITS, column_name, column_values, orbit_of
+from dpend.catalogue.table import MAY_MISS, UNITS, column_name, column_values, orbit_of
 from dpend.checks import known_real, one_of, several, shown
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.arc import RELEASED_SYMMETRIES
@@ -65,7 +65,8 @@ class Atlas:
             release angle) and `arclength` along it; `theta1`, `theta2`, `period`, `energy`,
             `kappa`, `log_abs_kappa`, `symmetry`, `residual`, `iterations` and `status` as in
             `PeriodicOrbit`, and from there `dual_theta1`, `dual_theta2`, `turns1`, `turns2`,
-            `theta2_error`, `period_error`.
+            `theta2_error`, `period_error`; `certificate`, the identifier of the row's proof (see
+            `certify_atlas`), or empty.
         families: a record for each, see `find_brake_families`; none for a single release angle.
         coverage: how they were found.
     """
@@ -143,8 +144,12 @@ class Atlas:
             draft.write_text(self._json() if path.suffix == ".json" else self._csv())
 
     def _columns(self) -> dict[str, list[Any]]:
-        """The table as files have it."""
-        return {column_name(key): column_values(key, column) for key, column in self.table.items()}
+        """The table as files have it, without what may be missing and says nothing."""
+        return {
+            column_name(key): column_values(key, column)
+            for key, column in self.table.items()
+            if key not in MAY_MISS or np.any(column != MAY_MISS[key])
+        }
 
     def _about(self) -> dict[str, Any]:
         from dpend._version import __version__

@@ -18,6 +18,7 @@ import numpy as np
 from dpend.catalogue.table import (
     COLUMNS,
     LONGEST,
+    MAY_MISS,
     SHORTEST,
     UNITS,
     Table,
@@ -53,7 +54,7 @@ _COVERAGE = {
     "exhausted": bool,
 }
 # Files of 0.1.0 say neither how many rows they have nor whether the search was broken off.
-_MAY_MISS = ("rows", "exhausted")
+_MAY_MISS = ("rows", "exhausted", *MAY_MISS)
 _FAMILY = {
     "family": str,
     "symmetry": str,
@@ -150,7 +151,8 @@ def _csv_parts(text: str) -> tuple[Any, _Rows]:
         if len(row) != len(header):
             raise ValueError(f"{place(i)} has {len(row)} cells, the header has {len(header)}")
     columns = list(zip(*(row for row, _ in found), strict=True)) or [()] * len(header)
-    by_name = dict(zip(header, columns, strict=True))
+    left_out = {name: [value] * len(found) for name, value in MAY_MISS.items()}
+    by_name = left_out | dict(zip(header, columns, strict=True))
     return about, _Rows(
         {key: _parse_cells(key, by_name[column_name(key)], place) for key in COLUMNS}, place
     )
@@ -202,6 +204,7 @@ def _json_parts(text: str) -> tuple[Any, _Rows]:
             raise ValueError(f"row {i + 1}: turns must be a list of two integers, is {turns!r:.60}")
         row |= {f"dual_{key}": value for key, value in dual.items()}
         row |= {"turns1": turns[0], "turns2": turns[1]}
+        rows[i] = MAY_MISS | row
     return about, _Rows(
         {key: [row[column_name(key)] for row in rows] for key in COLUMNS}, lambda i: f"row {i + 1}"
     )

@@ -6,6 +6,7 @@ neighbours on a family lie no further apart than arclength allows.
 """
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -48,6 +49,9 @@ _LOG_PERIOD = 3.0
 # Arclength itself is rounded to this.
 _ARCLENGTH = 1e-9
 
+# Identifiers of certificates.
+_IDENTIFIER = re.compile(r"([0-9a-f]{16})?")
+
 Table: TypeAlias = dict[str, np.ndarray]
 Families: TypeAlias = Mapping[str, dict[str, Any]]
 
@@ -81,7 +85,10 @@ COLUMNS: dict[str, type] = {
     "period_error": float,
     "iterations": int,
     "status": int,
+    "certificate": str,
 }
+# Columns that a file may leave out, and what they are without it.
+MAY_MISS = {"certificate": ""}
 
 
 def column_name(column: str) -> str:
@@ -112,6 +119,7 @@ def table_of(orbits: PeriodicOrbit, family: str, arclength: Any) -> Table:
         "turns2": orbits.turns[1],
         "theta2_error": orbits.error_estimate[0],
         "period_error": orbits.error_estimate[1],
+        "certificate": np.full(count, ""),
     }
     return {
         key: np.asarray(columns[key] if key in columns else getattr(orbits, key), kind)
@@ -200,6 +208,10 @@ class TableCheck(NamedTuple):
             f"the families are {', '.join(families)}" if families else "and there are no families"
         )
         self.refuse(~np.isin(table["family"], list(families) or [""]), "family", known)
+        proved = np.array(
+            [bool(_IDENTIFIER.fullmatch(text)) for text in table["certificate"]], bool
+        )
+        self.refuse(~proved, "certificate", "and must be empty or 16 hexadecimal digits")
         for name, family in families.items():
             wrong = (table["family"] == name) & (table["symmetry"] != family["symmetry"])
             self.refuse(wrong, "symmetry", f"its family {name} is {family['symmetry']}")

@@ -1,0 +1,221 @@
+"""Many proved digits: Newton's method in ball arithmetic on the same chain of discs.
+
+The polynomials of the discs get a higher order and coefficients of many bits. Each pass evaluates
+the defects of the differential equation and of the matches exactly enough, and solves for the
+corrections in float64 with the derivatives at hand, so that a pass gains ten digits or more. None
+of this needs to be right.
+
+The proof is that of `proof`, with the defects bounded at high precision and the derivatives on
+narrow tubes about the polynomials rounded to float64: Y is then as small as the defects, and Z is
+what it was.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from flint import arb, arb_poly, arb_series
+
+from dpend.proofs.balls import TINY, field, precision, upper
+from dpend.proofs.flow import COVER, Discs, cauchy_bounds, enclose, polynomial_defects
+from dpend.proofs.proof import (
+    BITS,
+    ORDER,
+    TERMS,
+    NoProof,
+    Proof,
+    contraction_box,
+    gap_of,
+    operator_of,
+)
+from dpend.proofs.taylor import jacobian_series, motion_series, tangent_series
+
+# Digits beyond those wanted that Newton's method aims at; digits that a term of a series brings
+# (discs are as long as 16 digits need 30 terms); bits of a decimal digit, and some to spare.
+EXTRA, DIGITS_A_TERM, BITS_A_DIGIT, SPARE_BITS = 10, 16 / 30, 3.33, 40
+# Half width of the tubes about the rounded polynomials, and the most digits and passes: bounds are
+# float64 numbers, which end at 1e-308.
+TUBE, MOST_DIGITS, PASSES = 1e-11, 250, 120
+# A pass that gains less than this factor is the last.
+LEAST_GAIN = 0.1
+
+
+class Digits(NamedTuple):
+    """theta2 [rad] and the duration of the arc [natural] as balls of `bits` bits."""
+
+    theta2: Any
+    duration: Any
+    bits: int
+
+
+class _Fine:
+    """Polynomials with coefficients of many bits: rows[i][k][n], and the duration."""
+
+    def __init__(self, proof: Proof, order: int) -> None:
+        self.chain, self.order = proof.chain, order
+        problem, discs = proof.chain.problem, proof.discs
+        step = discs.half * discs.duration
+        self.series = motion_series(self.chain.ratios, discs.series[0], step, order)
+        self.jacobian = jacobian_series(self.chain.ratios, self.series)
+        self.tangents = tangent_series(self.jacobian, step)
+        self.pendulum = problem.pendulum.balls()
+        self.duration = arb(discs.duration)
+        self.half = [arb(float(w)) for w in discs.half]
+        columns = np.moveaxis(self.series, 0, -1)
+        self.rows = [[[arb(float(x)) for x in row] for row in disc] for disc in columns]
+        if problem.ratio is None:
+            self.rows[0][0][0] = problem.theta1().mid()
+        for k in (2, 3):
+            self.rows[0][k][0] = arb(0)
+        for k in (0, 1):
+            if problem.turns is None:
+                self.rows[-1][2 + k][0] = arb(0)
+            else:
+                self.rows[-1][k][0] = (arb.pi() * problem.turns[k]).mid()
+        start = Discs(self.series, self.tangents, discs.half, discs.duration)
+        self.inverse = np.linalg.inv(self.chain.newton_matrix(start))
+        self.signs = start.signs()[:, None, None]
+        self.rates = self.series * np.arange(order + 1)[:, None, None] / discs.duration
+
+    def residuals(self) -> Any:
+        """Term by term d f(P) - P', in float64."""
+        out = np.zeros_like(self.series)
+        for i, rows in enumerate(self.rows):
+            step = self.duration * self.half[i]
+            slopes = field(self.pendulum, [arb_series(row) for row in rows])
+            for k in range(4):
+                known = slopes[k].coeffs()
+                for n in range(self.order):
+                    slope = step * known[n] if n < len(known) else arb(0)
+                    out[n, i, k] = float((slope - rows[k][n + 1] * (n + 1)).mid())
+        return out
+
+    def ends(self) -> list[tuple[Any, Any]]:
+        """The polynomials at s = 1 and s = -1."""
+        whole = [[arb_poly(row) for row in rows] for rows in self.rows]
+        return [([p(arb(1)) for p in row], [p(arb(-1)) for p in row]) for row in whole]
+
+    def correct(self) -> float:
+        """One pass; returns the size of the largest correction."""
+        left, chain = self.residuals(), self.chain
+        step = (chain.half * float(self.duration))[:, None]
+        local = np.zeros_like(left)
+        for n in range(self.order):
+            slope = np.einsum("jsab,jsb->sa", self.jacobian[: n + 1], local[n::-1])
+            local[n + 1] = (slope * step + left[n]) / (n + 1)
+        ends = self.ends()
+        gap = np.array(
+            [
+                [float((x - y).mid()) for x, y in zip(ends[i][0], ends[i + 1][1], strict=True)]
+                for i in range(chain.joints)
+            ]
+        )
+        gap += local.sum(0)[:-1] - (local * self.signs).sum(0)[1:]
+        change = -self.inverse @ gap.ravel()
+        states = np.zeros(chain.index.shape)
+        free = chain.index >= 0
+        states[free] = change[chain.index[free]]
+        if chain.problem.ratio is not None:
+            states[0, 0] = chain.problem.ratio * states[0, 1]
+        moved = local + np.einsum("jsab,sb->jsa", self.tangents, states) + self.rates * change[1]
+        self.add(moved, float(change[1]))
+        return float(max(np.abs(change).max(), np.abs(local).max()))
+
+    def add(self, change: Any, duration: float) -> None:
+        for i, rows in enumerate(self.rows):
+            for k, row in enumerate(rows):
+                for n in range(self.order + 1):
+                    row[n] = (row[n] + arb(float(change[n, i, k]))).mid()
+        if self.chain.problem.ratio is not None:
+            self.rows[0][0][0] = self.rows[0][1][0] * self.chain.problem.ratio
+        self.duration = (self.duration + arb(duration)).mid()
+
+    def defects(self, terms: int) -> Any:
+        """eta of every disc, the errors of the fixed parts of the states included."""
+        problem, out = self.chain.problem, np.zeros(self.chain.index.shape)
+        for i, rows in enumerate(self.rows):
+            # Sizes of the coefficients, enlarged by more than their rounding and what is lost below
+            # the least normal number; the rounding of P(0) is inside the tube.
+            floats = np.array([[float(x) for x in row] for row in rows]).T
+            floats[1:] = np.abs(floats[1:]) * (1 + 1e-15) + TINY
+            tails, _ = cauchy_bounds(self.pendulum, floats, TUBE, terms)
+            slopes = field(self.pendulum, [arb_series(row) for row in rows])
+            step = self.duration * self.half[i]
+            out[i] = polynomial_defects(slopes, rows, step, tails, terms)
+        if problem.ratio is None:
+            out[0, 0] += upper(problem.theta1() - self.rows[0][0][0])
+        if problem.turns is not None:
+            for k, turns in enumerate(problem.turns):
+                out[-1, k] += upper(arb.pi() * turns - self.rows[-1][k][0])
+        return out * COVER
+
+    def rounded(self) -> tuple[Discs, Any]:
+        """Discs of the proof's own order, rounded to float64, and how far from these they are."""
+        series = np.zeros((ORDER + 1, len(self.rows), 4))
+        distance = np.zeros(len(self.rows))
+        for i, rows in enumerate(self.rows):
+            for k, row in enumerate(rows):
+                series[:, i, k] = [float(x) for x in row[: ORDER + 1]]
+                near = (upper(x - arb(series[n, i, k])) for n, x in enumerate(row[: ORDER + 1]))
+                total = sum(near) + sum(upper(x) for x in row[ORDER + 1 :])
+                distance[i] = max(distance[i], total * COVER)
+        half, duration = self.chain.half, float(self.duration)
+        tangents = tangent_series(jacobian_series(self.chain.ratios, series), half * duration)
+        return Discs(series, tangents, half, duration), distance
+
+
+def refine(proof: Proof, digits: int) -> Digits:
+    """theta2 and the duration with errors below 10^-digits, proved anew.
+
+    Raises:
+        NoProof: with the reason.
+    """
+    goal = digits + EXTRA
+    order = int(goal / DIGITS_A_TERM) + 4
+    bits, terms = int(goal * BITS_A_DIGIT) + SPARE_BITS, order + 2
+    if digits > MOST_DIGITS:
+        raise NoProof(f"more than {MOST_DIGITS} digits are not tried")
+    try:
+        with precision(bits, terms):
+            fine = _Fine(proof, order)
+            _polish(fine, 10.0 ** (2 - goal))
+            return _prove_fine(fine, terms, bits, digits)
+    except NoProof:
+        raise
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        raise NoProof(str(error)) from error
+
+
+def _polish(fine: _Fine, enough: float) -> None:
+    last = math.inf
+    for _ in range(PASSES):
+        size = fine.correct()
+        if size < enough or size > last * LEAST_GAIN:
+            break
+        last = size
+
+
+def _prove_fine(fine: _Fine, terms: int, bits: int, digits: int) -> Digits:
+    chain, defects, ends = fine.chain, fine.defects(terms), fine.ends()
+    discs, distance = fine.rounded()
+    tube = np.full(len(discs.half), TUBE)
+    with precision(BITS, TERMS):
+        pendulum = chain.problem.pendulum.balls()
+        tubes = enclose(pendulum, discs, tube, TUBE, np.zeros_like(defects), TERMS)
+        middle, errors = chain.derivative(tubes)
+        inverse = np.linalg.inv(middle)
+    exact = tubes._replace(defect=defects)
+    radii = contraction_box(operator_of(inverse, gap_of(ends, exact), middle, errors))
+    if radii is None:
+        raise NoProof("the operator does not map any box at high precision into itself")
+    late = upper(fine.duration - arb(discs.duration)) + float(radii[1])
+    # Once for the rounding itself, twice for the excursion, which was bounded without it.
+    share = 2 * tubes.growth * (late / discs.duration) * COVER
+    space = tube - distance * (1 + share) * COVER
+    if not exact.holds(chain.by_unknown(radii), late, discs.duration, space) or late >= TUBE:
+        raise NoProof("the solutions from the box leave the tubes")
+    theta2 = fine.rows[0][1][0] + arb(0, float(radii[0]))
+    duration = fine.duration + arb(0, float(radii[1]))
+    if not max(radii[:2]) < 10.0**-digits:
+        raise NoProof(f"the error is {max(radii[:2]):.1e}, not below 1e-{digits}")
+    return Digits(theta2, duration, bits)
