@@ -14,6 +14,8 @@ from dpend._version import __version__ as __version__
 from dpend.catalogue.atlas import Atlas as Atlas
 from dpend.catalogue.atlas import Coverage as Coverage
 from dpend.catalogue.atlas import load_atlas as load_atlas
+from dpend.catalogue.energy import Census as Census
+from dpend.catalogue.energy import find_orbits as find_orbits
 from dpend.catalogue.release import find_brake_orbits as find_brake_orbits
 from dpend.catalogue.survey import find_brake_families as find_brake_families
 from dpend.inverse.design import Design as Design
@@ -21,6 +23,10 @@ from dpend.inverse.design import design_pendulum as design_pendulum
 from dpend.inverse.fit import Fit as Fit
 from dpend.inverse.fit import fit_parameters as fit_parameters
 from dpend.inverse.measurements import load_angles as load_angles
+from dpend.maps.periodic import periodic_points as periodic_points
+from dpend.maps.returns import Return as Return
+from dpend.maps.returns import return_map as return_map
+from dpend.maps.section import section as section
 from dpend.maps.store import StoreWarning as StoreWarning
 from dpend.maps.sweep import sweep as sweep
 from dpend.mechanics.linear import Equilibria as Equilibria
@@ -38,8 +44,12 @@ from dpend.mechanics.pendulum import positions as positions
 from dpend.mechanics.pendulum import released as released
 from dpend.mechanics.pendulum import vector_field as vector_field
 from dpend.mechanics.pendulum import velocities as velocities
+from dpend.mechanics.surface import Plane as Plane
+from dpend.mechanics.surface import on_energy as on_energy
 from dpend.methods.scheme import Scheme as Scheme
 from dpend.methods.scheme import scheme_for as scheme_for
+from dpend.motion.crossings import Crossings as Crossings
+from dpend.motion.crossings import crossings as crossings
 from dpend.motion.events import Crossing as Crossing
 from dpend.motion.events import first_crossing as first_crossing
 from dpend.motion.gradients import GradientCheck as GradientCheck

@@ -16,13 +16,13 @@ import jax
 import numpy as np
 import typer
 
-from dpend import orbit_commands, simulation_commands
+from dpend import orbit_commands, section_commands, simulation_commands
 from dpend._runtime import catch_interrupts, leave_quietly
 from dpend.options import app
 from dpend.terminal import tell_error
 
 # The files of the commands, which put them into `app` as they are imported, in the order of --help.
-COMMANDS = (orbit_commands, simulation_commands)
+COMMANDS = (orbit_commands, simulation_commands, section_commands)
 
 
 def _keep_compiled_code() -> None:

@@ -4,9 +4,10 @@ A command takes the pendulum that `options.command` makes of the shared options,
 each option of its own: these may be more than seven. It hands back a report, which is printed.
 """
 
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import jax
 import numpy as np
@@ -20,8 +21,8 @@ from dpend.catalogue.release import (
     check_period,
     foresee_steps,
 )
-from dpend.checks import number
-from dpend.mechanics.pendulum import Pendulum
+from dpend.checks import at_most_one, number, one_of
+from dpend.mechanics.pendulum import Pendulum, State
 from dpend.options import (
     Report,
     Theta1,
@@ -34,8 +35,9 @@ from dpend.options import (
     radians,
 )
 from dpend.orbits.find import swinging_pendulum
-from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
+from dpend.orbits.orbit import BRANCHES, FAMILIES, PeriodicOrbit
 from dpend.places import check_place, replacing
+from dpend.reading import read_orbit
 from dpend.report import (
     converged,
     design_record,
@@ -63,8 +65,19 @@ def orbit(
         float | None, numeric(help="Guess of the lower rod's release angle [deg].")
     ] = None,
     period: Annotated[float | None, numeric(help="Guess of the period [s].")] = None,
+    p1: Annotated[
+        float | None,
+        numeric(
+            "--p1", help="Of a motion that is not released from rest: momentum [kg m^2/s], near it."
+        ),
+    ] = None,
+    p2: Annotated[float | None, numeric("--p2", help="Of the lower angle, with --p1.")] = None,
     symmetry: Annotated[
-        str | None, typer.Option(help="centred or brake, with a guess; found out if not given.")
+        str | None,
+        typer.Option(
+            help="centred or brake, with a guess, also passing, odd or none with momenta; found "
+            "out if not given."
+        ),
     ] = None,
     ratio: Annotated[
         int | None,
@@ -74,32 +87,38 @@ def orbit(
         int | None,
         counted("Which of the branch's passages through theta1; 1 if not given."),
     ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write to F.json what --json prints, for dpend family.")
+    ] = None,
 ) -> Report:
-    """The releases from rest at THETA1 that come back: partner angle, period, stability, error."""
-    guess = _guess(theta2, period)
+    """The releases from rest at THETA1 that come back: partner angle, period, stability, error; or
+    the orbit near any motion.
+    """
+    formats = _formats(out, {".json": write_json})
+    guess, release = _guess(theta2, period), radians("theta1", theta1)
     if crossing is not None and branch is None:
         raise ValueError(
             f"crossing must go with branch, got {crossing} alone: give --branch "
             f"{' or '.join(BRANCHES)}"
         )
-    release = radians("theta1", theta1)
-    both = branch is None and guess is None and ratio is None
+    near = _near(release, guess, p1, p2)
+    both = branch is None and ratio is None and near == {"theta1": release}
     find = partial(
         dpend.find_orbit,
-        guess=guess,
+        pendulum,
+        **near,
         symmetry=symmetry,
         ratio=ratio,
         crossing=1 if crossing is None else crossing,
     )
     with clock("following the branch" if guess is None else "solving"):
-        found = {
-            name: find(pendulum, release, branch=name) for name in (BRANCHES if both else (branch,))
-        }
+        found = {name: find(branch=name) for name in (BRANCHES if both else (branch,))}
     records = [
         orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()
     ]
     record = {"orbits": records} if both else records[0]
-    return record, partial(print_orbits, pendulum, records), converged(*found.values())
+    _write(record, out, formats)
+    return record, partial(print_orbits, pendulum, records, out), converged(*found.values())
 
 
 def _guess(theta2: float | None, period: float | None) -> tuple[float, float] | None:
@@ -114,30 +133,90 @@ def _guess(theta2: float | None, period: float | None) -> tuple[float, float] | 
     return radians("theta2", theta2), number("period", period, positive=True, unit="s")
 
 
+def _near(
+    theta1: float, guess: tuple[float, float] | None, p1: float | None, p2: float | None
+) -> dict[str, Any]:
+    """What `find_orbit` starts from: a release, a guess of one, or a motion with momenta."""
+    if p1 is None and p2 is None:
+        return {"theta1": theta1} | ({} if guess is None else {"guess": guess})
+    if guess is None or p1 is None or p2 is None:
+        missing = "p1" if p1 is None else "p2" if p2 is None else "theta2"
+        raise ValueError(
+            f"{missing} must be given with a momentum, got none: a motion is theta1, theta2, p1, "
+            f"p2 and period"
+        )
+    return {"state": State(theta1, guess[0], p1, p2), "period": guess[1]}
+
+
+# How a record is written, by the suffix of its file.
+_Formats: TypeAlias = Mapping[str, Callable[[dict[str, Any], Path], None]]
+
+
+def _formats(out: Path | None, formats: _Formats) -> _Formats:
+    """The formats, once it is known that `out` can be written in one of them."""
+    if out is not None:
+        check_place("out", out, tuple(formats))
+    return formats
+
+
+def _write(found: dict[str, Any], out: Path | None, formats: _Formats) -> None:
+    if out is not None:
+        with replacing(out) as draft:
+            formats[out.suffix](found, draft)
+
+
 @command()
 def family(
     pendulum: Pendulum,
-    branch: Annotated[str, typer.Option(help="in-phase (slow mode) or anti-phase (fast mode).")],
+    branch: Annotated[
+        str | None,
+        typer.Option(
+            "--branch",
+            "--from",
+            help="in-phase (slow mode), anti-phase (fast mode), or of a saddle: down-up (lower rod "
+            "upright), up-down (upper rod upright).",
+        ),
+    ] = None,
+    orbit: Annotated[
+        Path | None, typer.Option(help="Of the orbit in F.json, from dpend orbit --out.")
+    ] = None,
+    special: Annotated[
+        int | None, counted("Go on to the branch that leaves there at this special point.")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Write all points to F.csv, or to F.json what --json prints."),
     ] = None,
 ) -> Report:
-    """All orbits of a normal mode, from small swings to the upright pendulum, and where their
-    stability changes.
+    """All orbits of a family, as of a normal mode from small swings to the upright pendulum, and
+    where their stability changes.
     """
-    if branch not in BRANCHES:
-        raise ValueError(f"branch must be one of {', '.join(BRANCHES)}, got {branch!r}")
-    formats = {".csv": write_family_csv, ".json": write_json}
-    if out is not None:
-        check_place("out", out, tuple(formats))
+    at_most_one(branch=branch, orbit=None if orbit is None else str(orbit))
+    if orbit is None and branch is None:
+        raise ValueError(f"branch must be given, or orbit, got neither: {', '.join(FAMILIES)}")
+    start = one_of("branch", branch, FAMILIES) if orbit is None else read_orbit(orbit, pendulum)
+    formats = _formats(out, {".csv": write_family_csv, ".json": write_json})
     with clock("following the family"):
-        found = dpend.follow_family(pendulum, branch)
+        found = dpend.follow_family(pendulum, start)
+        if special is not None:
+            found = _branch_of(pendulum, found, special)
     record = family_record(found, branch)
-    if out is not None:
-        with replacing(out) as draft:
-            formats[out.suffix](record, draft)
+    _write(record, out, formats)
     return record, partial(print_family, record, out), converged(found)
+
+
+def _branch_of(pendulum: Pendulum, family: dpend.Family, special: int) -> dpend.Family:
+    """The branch that leaves a family at the special point that tables give this number."""
+    points = family.special_points
+    if not 1 <= special <= len(points):
+        raise ValueError(
+            f"special must be the number of a special point, 1 to {len(points)}, got {special}: "
+            f"the family's table has them"
+        )
+    try:
+        return dpend.follow_family(pendulum, points[special - 1])
+    except ValueError as error:
+        raise ValueError(f"special must be where a branch leaves, got {special}: {error}") from None
 
 
 @command()

@@ -19,6 +19,7 @@ from dpend.motion.simulate import simulate
 from dpend.motion.trajectory import Trajectory
 from dpend.orbits.family import Family
 from dpend.orbits.orbit import PeriodicOrbit
+from dpend.section_picture import draw_periodic, draw_section
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -263,6 +264,45 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
     ax = _axes(ax)
     draw_map(ax, dataset, name)
     return ax
+
+
+def section(dataset: Any, ax: "Axes | Any | None" = None, *, periodic: Any | None = None) -> "Axes":
+    """A section: the crossings as dots, one colour a motion, inside the line that bounds what the
+    energy allows.
+
+    The angle is in degrees, the momentum in kg m^2/s. Crossings of side -1 are drawn at (-q, -p) on
+    the planes at 0 and pi, as their mirror image crosses there on side 1; on other planes they are
+    left out.
+
+    Arguments:
+        dataset: what `section` returned.
+        periodic: what `periodic_points` returned on the same plane: rings where |kappa| <= 1,
+            crosses where the orbit is unstable.
+    Raises:
+        ValueError: other datasets.
+    """
+    import xarray
+
+    instance("dataset", dataset, xarray.Dataset, "what dpend.section returns")
+    _check_variables("dataset", dataset, ("angle", "momentum", "side"), "dpend.section")
+    if periodic is not None:
+        instance("periodic", periodic, xarray.Dataset, "what dpend.periodic_points returns")
+        names = ("angle", "momentum", "kappa")
+        _check_variables("periodic", periodic, names, "dpend.periodic_points")
+    ax = _axes(ax)
+    draw_section(ax, dataset)
+    if periodic is not None:
+        draw_periodic(ax, periodic)
+    return ax
+
+
+def _check_variables(name: str, dataset: Any, wanted: tuple[str, ...], source: str) -> None:
+    missing = [key for key in wanted if key not in dataset]
+    if missing:
+        raise ValueError(
+            f"{name} must hold {', '.join(wanted)}, got one without {missing[0]}: give what "
+            f"{source} returns"
+        )
 
 
 def residuals(fit: Fit | Any) -> "Figure":

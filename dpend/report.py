@@ -12,16 +12,14 @@ import numpy as np
 import dpend
 from dpend.mechanics.pendulum import Pendulum
 from dpend.motion.trajectory import Trajectory
+from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.orbit import PeriodicOrbit
 from dpend.records import columns, json_text, record
 from dpend.status import Status
+from dpend.tables import print_table
 
-# Wider than any table here: a number is never broken to fit a terminal.
-_TABLE_WIDTH = 200
 # Rows of the table that stand for a family.
 _SHOWN_POINTS = 12
-# Columns of words, which begin at the left; numbers end at the right.
-_WORDS = ("", "symmetry", "stability", "family", "from", "to")
 # What a design tells the derivatives of: its name, and what it is multiplied by.
 _SLOPES = {
     "theta2_deg": ("theta2", math.degrees(1.0)),
@@ -35,26 +33,31 @@ _SLOPE_HEADINGS = {"period_s": "period (s)", "kappa": "kappa", "theta2_deg": "th
 def orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
     names = "period energy residual iterations status message symmetry kappa log_abs_kappa"
     return {
-        **record(orbit.state, "theta1 theta2"),
+        **record(orbit.state),
         **record(orbit, f"{names} stability"),
-        "dual": record(orbit.dual, "theta1 theta2"),
+        "dual": record(orbit.dual),
         **record(orbit, "turns error_estimate pendulum"),
     }
 
 
-def family_record(family: dpend.Family, branch: str) -> dict[str, Any]:
+def family_record(family: dpend.Family, branch: str | None) -> dict[str, Any]:
+    """Momenta only where they are not zero."""
+    rests = family.symmetry in RELEASED_SYMMETRIES
     table = columns(family, "arclength")
     table |= columns(family.orbits.state, "theta1 theta2")
     table |= columns(family.orbits, "period energy kappa log_abs_kappa error_estimate")
+    table |= {} if rests else columns(family.orbits.state, "p1 p2")
     points = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
     return {
         "branch": branch,
+        "symmetry": family.symmetry,
         "points": [point | {"symmetry": family.symmetry} for point in points],
         "bifurcations": [
             {
                 **record(point, "kind arclength"),
                 **record(point.orbit.state, "theta1 theta2"),
                 **record(point.orbit, "period energy kappa"),
+                **({} if rests else record(point.orbit.state, "p1 p2")),
             }
             for point in family.special_points
         ],
@@ -116,39 +119,31 @@ def print_json(found: dict[str, Any]) -> None:
     print(json_text(found))
 
 
-def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", title_style="")
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading in _WORDS else "right")
-    for row in rows:
-        table.add_row(*row)
-    console = Console(width=_TABLE_WIDTH, highlight=False)
-    with console.capture() as text:
-        console.print(table)
-    print(text.get(), end="")
-
-
 def _print_failure(found: dict[str, Any], whose: str = "") -> None:
     if found["status"] != "converged":
         print(f"{whose}{found['status']}: {found['message']}")
 
 
-def _describe(pendulum: Pendulum) -> str:
+def _describe(pendulum: Pendulum, symmetry: str = "") -> str:
     l1, l2, m1, m2, g = (f"{float(value):g}" for value in jax.tree.leaves(pendulum))
     bobs = f"l1 = {l1} m, l2 = {l2} m, m1 = {m1} kg, m2 = {m2} kg"
-    return f"{bobs}, g = {g} m/s^2, released from rest"
+    rests = not symmetry or symmetry in RELEASED_SYMMETRIES
+    return f"{bobs}, g = {g} m/s^2, {'released from' if rests else 'never at'} rest"
 
 
-def print_orbits(pendulum: Pendulum, records: Sequence[dict[str, Any]]) -> None:
-    headings = ("", "theta1 (deg)", "theta2 (deg)", "period (s)", "stability", "kappa")
+def print_orbits(
+    pendulum: Pendulum, records: Sequence[dict[str, Any]], out: Path | None = None
+) -> None:
+    symmetry = records[0]["symmetry"]
+    rests = symmetry in RELEASED_SYMMETRIES
+    moving = () if rests else ("p1 (kg m^2/s)", "p2 (kg m^2/s)", "turns")
+    headings = ("", "theta1 (deg)", "theta2 (deg)", *moving, "period (s)", "stability", "kappa")
     rows = [
         (
             one.get("branch") or one["symmetry"],
             f"{one['theta1_deg']:.10g}",
             f"{one['theta2_deg']:.9f}",
+            *(() if rests else (*_momenta(one), "{}, {}".format(*one["turns"]))),
             f"{one['period_s']:.11f}",
             one["stability"],
             f"{one['kappa']:.6g}",
@@ -156,28 +151,37 @@ def print_orbits(pendulum: Pendulum, records: Sequence[dict[str, Any]]) -> None:
         )
         for one in records
     ]
-    _print_table(_describe(pendulum), (*headings, "error (deg, s)"), rows)
+    print_table(_describe(pendulum, symmetry), (*headings, "error (deg, s)"), rows)
     for one in records:
         _print_failure(one, f"{one.get('branch') or 'guess'}: ")
+    _print_place(out)
 
 
 def print_family(found: dict[str, Any], out: Path | None) -> None:
-    points = found["points"]
+    points, symmetry = found["points"], found["symmetry"]
     chosen = np.unique(np.linspace(0, len(points) - 1, _SHOWN_POINTS).round().astype(int))
-    shown = [points[i] | {"kind": ""} for i in chosen] + found["bifurcations"]
-    headings = ("theta1 (deg)", "theta2 (deg)", "period (s)", "energy (J)", "stability")
+    special = [row | {"number": str(i)} for i, row in enumerate(found["bifurcations"], start=1)]
+    shown = [points[i] | {"kind": "", "number": ""} for i in chosen] + special
+    moving = () if symmetry in RELEASED_SYMMETRIES else ("p1 (kg m^2/s)", "p2 (kg m^2/s)")
+    headings = ("theta1 (deg)", "theta2 (deg)", *moving, "period (s)", "energy (J)", "stability")
     rows = [_family_point(row) for row in sorted(shown, key=lambda row: row["arclength"])]
     pendulum = Pendulum(*found["pendulum"].values())
-    _print_table(_describe(pendulum), (*headings, "log |kappa|", ""), rows)
+    print_table(_describe(pendulum, symmetry), (*headings, "log |kappa|", "special", ""), rows)
     worst = max(point["theta2_error_deg"] for point in points)
-    print(
-        "{} orbits from {} to {}; error of theta2 at most {:.0e} deg".format(
-            len(points), *found["ends"], worst
-        )
-    )
+    what = "the direction at the start" if symmetry == "passing" else "theta2"
+    ends = "{} {} orbits from {} to {}".format(len(points), symmetry, *found["ends"])
+    print(f"{ends}; error of {what} at most {worst:.0e} deg")
     _print_failure(found)
+    _print_place(out)
+
+
+def _print_place(out: Path | None) -> None:
     if out is not None:
         print(f"written to {out}")
+
+
+def _momenta(row: dict[str, Any]) -> tuple[str, str]:
+    return f"{row['p1_kg_m2_s']:.10g}", f"{row['p2_kg_m2_s']:.10g}"
 
 
 def _family_point(row: dict[str, Any]) -> tuple[str, ...]:
@@ -185,12 +189,14 @@ def _family_point(row: dict[str, Any]) -> tuple[str, ...]:
     marginal = row["kind"].startswith("stability")
     logarithm = math.log(max(abs(row["kappa"]), sys.float_info.min))
     return (
-        f"{row['theta1_deg']:.9f}",
-        f"{row['theta2_deg']:.9f}",
+        f"{row['theta1_deg']:z.9f}",
+        f"{row['theta2_deg']:z.9f}",
+        *(_momenta(row) if "p1_kg_m2_s" in row else ()),
         f"{row['period_s']:.10f}",
         f"{row['energy_J']:.9f}",
         "" if marginal else dpend.stability_class(row["kappa"]),
         "0" if marginal else f"{row.get('log_abs_kappa', logarithm):.5g}",
+        row["number"],
         row["kind"],
     )
 
@@ -199,12 +205,12 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
     title = _describe(atlas.pendulum)
     if theta1 is None:
         families = [_family_row(atlas, one) for one in atlas.families]
-        _print_table(title, ("family", "periods (s)", "from", "to", "orbits"), families)
+        print_table(title, ("family", "periods (s)", "from", "to", "orbits"), families)
         what = f"{len(atlas.families)} families with {len(atlas)} orbits in the table"
     else:
         headings = ("theta2 (deg)", "period (s)", "symmetry", "stability", "kappa", "dual (deg)")
         orbits = [_atlas_row(orbit_record(orbit)) for orbit in atlas.orbits]
-        _print_table(title, (*headings, "error (deg)"), orbits)
+        print_table(title, (*headings, "error (deg)"), orbits)
         what = f"{len(atlas)} orbits with theta1 = {theta1:g} deg"
     seen = atlas.coverage
     print(
@@ -222,8 +228,7 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
         f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding "
         f"number {agree}"
     )
-    if out is not None:
-        print(f"written to {out}")
+    _print_place(out)
 
 
 def _atlas_row(row: dict[str, Any]) -> tuple[str, ...]:
@@ -281,7 +286,7 @@ def print_design(found: dict[str, Any], theta1: float) -> None:
         f"{one['branch']}\n{heading}" for one in orbits for heading in _SLOPE_HEADINGS.values()
     ]
     title = "derivatives with respect to the logarithms"
-    _print_table(title, ("", "start", "found", *headings), rows)
+    print_table(title, ("", "start", "found", *headings), rows)
     missed = ", ".join(f"{name} {value:.0e}" for name, value in found["missed"].items())
     bounds = f"; at bounds: {', '.join(found['at_bounds'])}" if found["at_bounds"] else ""
     print(
@@ -296,11 +301,11 @@ def print_motion(found: dict[str, Any], times: int, out: Path | None) -> None:
     angles = f"theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg"
     print(f"after {found['duration_s']:g} s   {angles}")
     print(f"                p1 = {final['p1']:.12g}, p2 = {final['p2']:.12g} kg m^2/s")
-    print(
-        f"error estimate  {found['error_estimate']:.1e} rad, energy drift "
-        f"{found['energy_drift']:.1e} of its scale"
-    )
-    print(f"integrated by   {found['method']}, {found['steps']} steps of {found['step_s']:.4g} s")
+    drift = f"{found['energy_drift']:.1e} of its scale"
+    print(f"error estimate  {found['error_estimate']:.1e} rad, energy drift {drift}")
+    mean = " in the mean" if found["method"] == "collocation" else ""
+    step = f"{found['steps']} steps of {found['step_s']:.4g} s{mean}"
+    print(f"integrated by   {found['method']}, {step}")
     _print_failure(found)
     if out is not None:
         print(f"written to      {out}: {times} times")
@@ -313,6 +318,24 @@ def print_map(found: dict[str, Any], figure: Path | None) -> None:
         f"{found['scheme']['step_s']:.4g} s"
     )
     print(f"written to {found['out']}" + (f", drawn in {figure}" if figure else ""))
+
+
+def print_section(found: dict[str, Any], figure: Path | None) -> None:
+    print(
+        f"{found['crossings']} crossings by {found['starts']} motions of {found['energy_J']:g} J, "
+        f"right to {found['largest_energy_error_J']:.0e} J; {found['failed']} motions failed"
+    )
+    columns = "returns", "angle_deg", "momentum_kg_m2_s", "period_s", "stability", "kappa"
+    forms = "{}", "{:.9f}", "{:.12f}", "{:.11f}", "{}", "{:.6g}"
+    rows = [
+        [form.format(row[key]) for form, key in zip(forms, columns, strict=True)]
+        for row in found["periodic_orbits"]
+    ]
+    headings = "returns", "angle (deg)", "momentum (kg m^2/s)", "period (s)", "stability", "kappa"
+    if rows:
+        print_table("periodic orbits, the first point of each", headings, rows)
+    written = {"written to": found["out"], "drawn in": figure}
+    print(*(f"{how} {where}" for how, where in written.items() if where), sep=", ")
 
 
 def print_films(found: dict[str, Any], releases: Sequence[tuple[float, float]]) -> None:

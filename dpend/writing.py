@@ -9,6 +9,7 @@ import dpend
 from dpend.motion.trajectory import Trajectory
 from dpend.places import check_place, replacing
 from dpend.records import columns, json_text
+from dpend.section_picture import draw_periodic
 
 
 def writer(path: Path) -> Callable[[Trajectory], None]:
@@ -62,6 +63,23 @@ def draw(field: Any, path: Path) -> None:
         fig, axes = plt.subplots(1, len(names), figsize=size, layout="constrained", squeeze=False)
         for name, ax in zip(names, axes[0], strict=True):
             plots.map_of(field, name, ax)
+        return fig
+
+    _save_figure(picture, path, dpi=200)
+
+
+def draw_section(found: Any, orbits: list[Any], path: Path) -> None:
+    """A section, with the periodic orbits of each number of returns."""
+
+    def picture() -> Any:
+        import matplotlib.pyplot as plt
+
+        from dpend import plots
+
+        fig, ax = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
+        plots.section(found, ax)
+        for rows in orbits:
+            draw_periodic(ax, rows)
         return fig
 
     _save_figure(picture, path, dpi=200)

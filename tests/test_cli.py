@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -504,6 +505,81 @@ def test_a_family_as_json_and_csv(capsys, tmp_path):
         assert (status, text, err.count("\n")) == (2, "", 1)
 
 
+# A motion of the paper's pendulum whose lower rod turns over once a period.
+ROTATING = "--theta1 0 --theta2 0 --p1 -0.0141 --p2 0.0409 --period 0.42".split()
+
+
+@pytest.mark.slow
+def test_families_of_an_orbit_a_saddle_and_a_special_point(capsys, tmp_path):
+    out = tmp_path / "rotating.json"
+    status, text, err = run(capsys, "orbit", *ROTATING, "--out", out)
+    assert (status, err) == (0, "")
+    assert "never at rest" in text
+    orbit = json.loads(out.read_text())
+    assert (orbit["symmetry"], orbit["turns"], orbit["status"]) == ("passing", [0, 1], "converged")
+    status, found = run_json(capsys, "family", "--orbit", out)
+    assert (status, found["branch"], found["symmetry"]) == (0, None, "passing")
+    assert found["ends"] == ["homoclinic", "fast rotation"]
+    nearest = min(found["points"], key=lambda one: abs(one["period_s"] - orbit["period_s"]))
+    assert abs(nearest["energy_J"] - orbit["energy_J"]) < 1e-12
+    assert abs(nearest["p2_kg_m2_s"] - orbit["p2_kg_m2_s"]) < 1e-12
+    for branch in ("down-up", "up-down"):
+        status, found = run_json(capsys, "family", "--from", branch)
+        assert (status, found["branch"], found["symmetry"]) == (0, branch, "centred")
+        # 5.2835080 sqrt(l/g) is the linear period.
+        assert abs(found["points"][0]["period_s"] * 7 / 5.2835080 - 1) < 1e-3
+    status, text, _ = run(capsys, "family", "--from", "anti-phase", "--special", 7)
+    assert status == 0
+    assert "odd orbits from branch point to homoclinic" in text
+    for bad, words in (
+        (("--from", "up-down", "--special", 1), "special must be where a branch"),
+        (("--from", "anti-phase", "--special", 99), "special must be the number"),
+        (("--orbit", out, "--g", 1), "orbit must be one of this pendulum"),
+    ):
+        status, text, err = run(capsys, "family", *bad)
+        assert (status, text, err.count("\n")) == (2, "", 1)
+        assert words in err
+
+
+def test_a_file_that_holds_no_orbit_is_refused(capsys, tmp_path):
+    names = {"l1_m": 0.2, "l2_m": 0.2, "m1_kg": 0.1, "m2_kg": 0.1, "g_m_s2": 9.8}
+    state = {"theta1_deg": 0, "theta2_deg": 0.0, "p1_kg_m2_s": -0.0141, "p2_kg_m2_s": 0.0409}
+    right = {**state, "period_s": 0.42, "status": "converged", "symmetry": "passing",
+             "turns": [0, 1], "dual": state, "pendulum": names}  # fmt: skip
+    file = tmp_path / "o.json"
+    wrong = [
+        ("period_s", -1, "period_s must be"),
+        ("symmetry", "round", "symmetry must be one of"),
+        ("turns", [0, 0.5], "turns must be integers"),
+        ("turns", 3, "turns must be a pair"),
+        ("dual", None, "dual must be an object"),
+        ("p1_kg_m2_s", "x", "p1_kg_m2_s must be"),
+        ("theta1_deg", True, "theta1_deg must be"),
+        ("status", "max_iterations", "its status is not converged"),
+        ("pendulum", names | {"m1_kg": 0}, "m1 must be"),
+        ("pendulum", names | {"m1_kg": 0.3}, "orbit must be one of this pendulum.* --m1 0.3"),
+        ("orbits", [right, right], "it must hold one orbit"),
+    ]
+    for key, value, words in wrong:
+        file.write_text(json.dumps(right | {key: value}))
+        status, out, err = run(capsys, "family", "--orbit", file)
+        assert (status, out, err.count("\n")) == (2, "", 1), err
+        assert re.search(f"orbit must be .*{words}|{words}", err), err
+    for text in ("", "[]", "{}", "{", "NaN"):
+        file.write_text(text)
+        status, out, err = run(capsys, "family", "--orbit", file)
+        assert (status, out, err.count("\n")) == (2, "", 1), err
+    file.unlink()
+    for bad in (("family", "--orbit", file), ("family",), ("family", "--from", "x"),
+                ("family", "--orbit", file, "--from", "in-phase"),
+                ("orbit", "--theta1", 0, "--p1", 1), ("orbit", *ROTATING[:8]),
+                ("orbit", *ROTATING, "--branch", "in-phase"),
+                ("orbit", *ROTATING, "--symmetry", "round"),
+                ("orbit", *ROTATING, "--out", "f.csv")):  # fmt: skip
+        status, out, err = run(capsys, *bad)
+        assert (status, out, err.count("\n")) == (2, "", 1), err
+
+
 def test_the_atlas_of_an_angle(capsys, tmp_path):
     status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
     assert status == 0
@@ -539,10 +615,10 @@ def test_the_atlas_of_an_angle(capsys, tmp_path):
 
 def test_a_search_that_missed_something_says_so(capsys, monkeypatch):
     def forgetful(*arguments):
-        result = dpend.catalogue.scan.scan_release(*arguments)
+        result = dpend.catalogue.scan.scan_circle(*arguments)
         return dataclasses.replace(result, zeros=result.zeros[1:])
 
-    monkeypatch.setattr(dpend.catalogue.release, "scan_release", forgetful)
+    monkeypatch.setattr(dpend.catalogue.release, "scan_circle", forgetful)
     status, found = run_json(capsys, "atlas", "--theta1", 40, "--max-period", 1.3)
     assert (status, len(found["orbits"]), found["coverage"]["suspicious_cells"]) == (1, 4, 1)
 
@@ -563,8 +639,8 @@ def test_the_atlas_of_the_square(capsys, tmp_path, monkeypatch):
 # too.
 FUZZED = {
     "orbit": (("--theta1", "40", "--branch", "in-phase"), "theta1 theta2 period branch symmetry "
-                                                          "ratio crossing"),
-    "family": (("--branch", "in-phase"), "branch out"),
+                                                          "p1 p2 ratio crossing out"),
+    "family": (("--branch", "in-phase"), "branch orbit special out"),
     "atlas": (("--theta1", "40", "--max-period", "1"), "theta1 max-period out store"),
     "design": (
         ("--theta1", "60", "--branch", "in-phase", "--period", "1"), "theta1 branch period kappa "
@@ -773,3 +849,36 @@ def test_a_noise_that_no_angle_has_is_refused(capsys, monkeypatch, tmp_path):
         2,
         "dpend: data.csv must have one column theta2_deg, got 2: keep one of them\n",
     )
+
+
+@pytest.mark.slow
+def test_a_section_with_its_store_its_picture_and_its_orbits(capsys, tmp_path):
+    out, figure = tmp_path / "S.zarr", tmp_path / "S.png"
+    status, found = run_json(
+        capsys, "section", "--energy", -0.42, "--starts", 5, "--count", 12, "--periodic", 2,
+        "--out", out, "--figure", figure,
+    )  # fmt: skip
+    assert (status, found["failed"], found["crossings"]) == (0, 0, 60)
+    assert found["largest_energy_error_J"] < 1e-9
+    kappa = {row["returns"]: row["kappa"] for row in found["periodic_orbits"]}
+    assert kappa.keys() == {1, 2}
+    in_phase = found["periodic_orbits"][3]  # the longest of one return
+    assert abs(in_phase["period_s"] - 1.21) < 0.01
+    assert in_phase["stability"] == "elliptic"
+    assert figure.stat().st_size > 10_000
+    assert (out / "zarr.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--energy", -9), "energy must be above the lowest one on .*, got -9 J: give a higher"),
+        (("--energy", 0, "--angle", "x"), "angle must be one of theta1, theta2, got 'x'"),
+        (("--energy", 0, "--count", 0), "count must be an integer of at least 1, got 0"),
+        (("--energy", 0, "--out", "."), "out must be a new name in a directory .*already"),
+    ],
+)
+def test_bad_sections_are_refused_in_one_line(capsys, words, line):
+    status, out, err = run(capsys, "section", *words)
+    assert (status, out) == (2, "")
+    assert re.fullmatch(f"dpend: {line}.*\n", err), err

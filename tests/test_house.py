@@ -17,22 +17,25 @@ import dpend
 # The public names, `dpend` itself, come last but for the doors, which draw, print and serve.
 ORDER = """
 _version _runtime checks places status records
-mechanics.trig mechanics.pendulum mechanics.linear mechanics.units
+mechanics.trig mechanics.pendulum mechanics.surface mechanics.linear mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.nodes methods.collocation methods.scheme
 motion.integrate motion.estimate motion.trajectory motion.adaptive motion.variation motion.saved
 motion.stepped motion.tables motion.simulate motion.reference motion.root motion.events
-motion.gradients
+motion.crossings motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
+maps.section maps.returns maps.periodic
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
-orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.crossings orbits.special
-orbits.find orbits.family orbits.continuation
+orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.zones orbits.special
+orbits.passages orbits.through orbits.find orbits.family orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
-catalogue.release catalogue.track catalogue.progress catalogue.entries catalogue.survey
+catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
+catalogue.survey
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture plots animate report writing terminal options orbit_commands simulation_commands cli
+map_picture section_picture plots animate tables report writing reading terminal options
+orbit_commands simulation_commands section_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
@@ -48,7 +51,7 @@ LONG_FUNCTIONS = {
 }  # fmt: skip
 BRANCHING = {"find_orbit", "_check_request", "follow_curve"}
 # The command line prints results and, on standard error, what it does.
-PRINTING = ["report", "terminal"]
+PRINTING = ["report", "tables", "terminal"]
 
 
 def name_of(path: Path) -> str:

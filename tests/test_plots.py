@@ -9,6 +9,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import xarray
 
 import dpend
 from dpend import plots
@@ -97,3 +98,31 @@ def test_a_family_is_solid_where_it_is_stable(paper):
     assert sum(len(mark.get_xdata()) for mark in marks) == len(family.special_points)
     with pytest.raises(ValueError, match="plane must be one of angles, period, got 'momenta'"):
         plots.family(family, plane="momenta")
+
+
+def test_a_section_shows_the_mirror_of_what_falls_and_its_periodic_points():
+    """Drawn from a dataset made by hand: crossings of side -1 are turned into those of side 1."""
+    both = ("start", "crossing")
+    data = {
+        "angle": (both, [[0.1, -0.2], [0.3, np.nan]]),
+        "momentum": (both, [[0.01, -0.02], [0.03, np.nan]]),
+        "side": (both, np.array([[1, -1], [1, 0]], np.int8)),
+    }
+    attributes = {"l1": 0.2, "l2": 0.2, "m1": 0.1, "m2": 0.1, "g": 9.8, "energy": -0.3}
+    found = xarray.Dataset(data, attrs=attributes | {"plane": "theta1", "plane_at": 0.0})
+    orbits = xarray.Dataset(
+        {
+            "angle": (("orbit", "return"), [[0.0], [0.5]]),
+            "momentum": (("orbit", "return"), [[0.02], [0.01]]),
+            "kappa": ("orbit", [0.3, 2.0]),
+        }
+    )
+    ax = plots.section(found, periodic=orbits)
+    dots, stable, unstable = (item.get_offsets().data for item in ax.collections)
+    expected = [[np.degrees(0.1), 0.01], [np.degrees(0.2), 0.02], [np.degrees(0.3), 0.03]]
+    np.testing.assert_allclose(dots, expected)
+    np.testing.assert_allclose(stable, [[0.0, 0.02]])
+    np.testing.assert_allclose(unstable, [[np.degrees(0.5), 0.01]])
+    assert (ax.get_xlabel(), ax.get_title()) == ("theta2 (deg)", "theta1 = 0 deg, E = -0.3 J")
+    with pytest.raises(ValueError, match="dataset must hold .* got one without angle"):
+        plots.section(orbits.drop_vars("angle"))

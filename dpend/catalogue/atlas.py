@@ -16,7 +16,8 @@ from dpend.catalogue.files import read_catalogue
 from dpend.catalogue.table import UNITS, column_name, column_values, orbit_of
 from dpend.checks import known_real, one_of, several, shown
 from dpend.mechanics.pendulum import Pendulum
-from dpend.orbits.orbit import RELEASED_SYMMETRIES, PeriodicOrbit
+from dpend.orbits.arc import RELEASED_SYMMETRIES
+from dpend.orbits.orbit import PeriodicOrbit
 from dpend.places import check_place, file_path, replacing
 from dpend.records import json_text, record
 

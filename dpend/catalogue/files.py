@@ -25,7 +25,7 @@ from dpend.catalogue.table import (
     column_name,
 )
 from dpend.mechanics.pendulum import Pendulum
-from dpend.orbits.orbit import RELEASED_SYMMETRIES
+from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.places import read_text
 from dpend.records import file_name, parse_json, units_of
 from dpend.status import Status

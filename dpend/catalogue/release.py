@@ -13,6 +13,7 @@ import numpy as np
 
 from dpend._runtime import require_float64
 from dpend.catalogue.atlas import Atlas, Coverage
+from dpend.catalogue.rows import Releases
 from dpend.catalogue.scan import (
     MOTIONS_PER_WAVE,
     RETURNS_PER_WAVE,
@@ -22,7 +23,7 @@ from dpend.catalogue.scan import (
     Zero,
     foresee,
     longest,
-    scan_release,
+    scan_circle,
 )
 from dpend.catalogue.table import stack_tables, table_of
 from dpend.checks import function, known_number
@@ -57,7 +58,7 @@ _FARTHEST_UNIT = 90
 # lies inside.
 BEYOND = 1e-3
 # An orbit of the longest period is in the list although its period is rounded by this share.
-_PERIOD_ROUNDING = 1e-12
+PERIOD_ROUNDING = 1e-12
 # A return is known to this share of its cell.
 _LOCATED = 0.2
 # A return is known to no better than this [rad], however narrow its cell.
@@ -113,13 +114,11 @@ def find_brake_orbits(
     if progress is not None:
         progress(0, expected)
         budget.tell = lambda spent: progress(spent, max(spent, expected))
-    counts: list[int] = []
-    for refinement in range(_MOST_REFINEMENTS + 1):
-        result = returns(fixed, theta1, max_period, _INTERVALS << refinement, budget)
-        counts.append(len(result.zeros))
-        unsettled = max(counts[-3:]) - min(counts[-3:])
-        if (len(counts) > 2 and not unsettled) or budget.exhausted:
-            break
+
+    def scan(intervals: int) -> Scan:
+        return returns(fixed, theta1, max_period, intervals, budget)
+
+    result, refinement, unsettled = settle(scan, budget)
     found, lost = _solve_returns(fixed, theta1, max_period, result, budget)
     coverage = Coverage(
         theta2_points=result.motions,
@@ -134,6 +133,20 @@ def find_brake_orbits(
         exhausted=budget.exhausted,
     )
     return Atlas(fixed, max_period, stack_tables([_row(orbit) for orbit in found]), (), coverage)
+
+
+def settle(scan: Callable[[int], Scan], budget: Budget) -> tuple[Scan, int, int]:
+    """The scan from so many intervals that the number of returns has stood through two doublings of
+    them, how many doublings there were, and by how much the last ones changed the number.
+    """
+    counts: list[int] = []
+    for refinement in range(_MOST_REFINEMENTS + 1):
+        result = scan(_INTERVALS << refinement)
+        counts.append(len(result.zeros))
+        unsettled = max(counts[-3:]) - min(counts[-3:])
+        if (len(counts) > 2 and not unsettled) or budget.exhausted:
+            break
+    return result, refinement, unsettled
 
 
 def _check_angle(theta1: Any) -> float:
@@ -196,7 +209,11 @@ def foresee_steps(pendulum: Pendulum, max_period: float, theta1: float) -> int:
     """The time steps that `find_brake_orbits` will take, roughly: three scans, and the returns
     solved.
     """
-    seen = foresee_returns(pendulum, theta1, max_period)
+    return steps_of(foresee_returns(pendulum, theta1, max_period))
+
+
+def steps_of(seen: Outlook) -> int:
+    """The time steps of three scans, and of the returns solved."""
     motions = 2 * (_INTERVALS << 3) + 3 * MOTIONS_PER_WAVE * seen.waves
     return int(
         min(motions * seen.rows + RETURNS_PER_WAVE * seen.waves * STEPS_PER_ORBIT, COUNTABLE)
@@ -205,8 +222,8 @@ def foresee_steps(pendulum: Pendulum, max_period: float, theta1: float) -> int:
 
 def foresee_returns(pendulum: Pendulum, theta1: float, max_period: float) -> Outlook:
     """What `returns` has before it."""
-    scaled, half, _ = _in_natural_units(pendulum, max_period)
-    return foresee(scaled, math.remainder(theta1, 2 * math.pi), half)
+    scaled, half, _ = in_natural_units(pendulum, max_period)
+    return foresee(Releases(scaled, math.remainder(theta1, 2 * math.pi)), half)
 
 
 def make_budget(most_steps: float, expected: int, max_period: float) -> Budget:
@@ -220,7 +237,7 @@ def make_budget(most_steps: float, expected: int, max_period: float) -> Budget:
     return Budget(int(min(most_steps, COUNTABLE)))
 
 
-def _in_natural_units(pendulum: Pendulum, max_period: float) -> tuple[Pendulum, float, float]:
+def in_natural_units(pendulum: Pendulum, max_period: float) -> tuple[Pendulum, float, float]:
     """The pendulum, the longest half period with a margin, and the second."""
     second = math.sqrt(pendulum.l1 / pendulum.g)
     return jax.tree.map(float, natural(pendulum)), 0.5 * max_period / second * (1 + BEYOND), second
@@ -230,8 +247,9 @@ def returns(
     pendulum: Pendulum, theta1: float, max_period: float, intervals: int, budget: Budget
 ) -> Scan:
     """All returns to rest within half of `max_period`, times in seconds."""
-    scaled, half, second = _in_natural_units(pendulum, max_period)
-    result = scan_release(scaled, math.remainder(theta1, 2 * math.pi), half, intervals, budget)
+    scaled, half, second = in_natural_units(pendulum, max_period)
+    circle = Releases(scaled, math.remainder(theta1, 2 * math.pi))
+    result = scan_circle(circle, half, intervals, budget)
     zeros = tuple(
         zero._replace(time=zero.time * second, row=zero.row * second) for zero in result.zeros
     )
@@ -249,16 +267,16 @@ def _solve_returns(
     lost = 0
     own_mirror = abs(math.sin(theta1)) < _OWN_MIRROR
     for zero in sorted(result.zeros, key=lambda zero: zero.time):
-        if (own_mirror and zero.theta2 < 0) or np.any(are_returns(known, zero)):
+        if (own_mirror and zero.angle < 0) or np.any(are_returns(known, zero)):
             continue
         if budget.exhausted:
             lost += 1
             continue
-        orbit = find_orbit(pendulum, theta1, guess=(zero.theta2, 2 * zero.time))
+        orbit = find_orbit(pendulum, theta1, guess=(zero.angle, 2 * zero.time))
         budget.spend(STEPS_PER_ORBIT)
         if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
             lost += 1
-        elif float(orbit.period) <= max_period * (1 + _PERIOD_ROUNDING):
+        elif float(orbit.period) <= max_period * (1 + PERIOD_ROUNDING):
             found.append(orbit)
             known = np.vstack([known, _place_of(orbit)])
     return sorted(found, key=lambda orbit: float(orbit.period)), lost
@@ -275,7 +293,7 @@ def _place_of(orbit: PeriodicOrbit) -> np.ndarray:
 
 def are_returns(places: np.ndarray, zero: Zero) -> np.ndarray:
     """The same of many orbits' theta2 and half periods, shape (n, 2)."""
-    apart = np.abs(places[:, 0] - zero.theta2)
+    apart = np.abs(places[:, 0] - zero.angle)
     apart = np.abs(apart - 2 * np.pi * np.round(apart / (2 * np.pi)))
     half = places[:, 1]
     late = np.abs(zero.time - half * np.maximum(1, np.round(zero.time / half)))

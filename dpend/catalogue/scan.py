@@ -1,22 +1,24 @@
-"""Every return to rest of one release angle: all zeros of the momenta over theta2 and time.
+"""Every return of the motions that start on a circle: all zeros of G over their angle and time.
 
-With theta1 given, G(theta2, t) = p(t)/t of the motion released at (theta1, theta2) is a smooth map
-of a rectangle to the plane, and its zeros are the brake orbits; the division takes away the line t
-= 0, where every motion is at rest. Lanes of motions with their tangent in theta2 give G, both its
-slopes and the mixed derivative on a grid, from which each cell has its bicubic; the convex hull of
-a bicubic's Bernstein coefficients tells what a cell is:
+G(theta2, t) = p(t)/t of the motion released at (theta1, theta2), or G(phi, t) = sin(theta(t))/t of
+the motion that leaves a place of {0, pi}^2 in the direction phi (see `rows`), is a smooth map of a
+rectangle to the plane, and its zeros are the brake orbits of theta1, or the passing orbits of an
+energy; the division takes away the line t = 0, where every motion is at rest, or at its place.
+Lanes of motions with their tangent in the angle give G, both its slopes and the mixed derivative on
+a grid, from which each cell has its bicubic; the convex hull of a bicubic's Bernstein coefficients
+tells what a cell is:
 
 - empty: the hull lies to one side of zero;
 - simple: after multiplication with the inverse of its mean, the derivative is near enough to the
   unit matrix everywhere that the map is one to one: one zero at most, and Newton's method says
   whether it is there;
-- neither: it is halved in time if it is bent more that way, else its interval of theta2 is.
+- neither: it is halved in time if it is bent more that way, else its interval of the angle is.
 
 All of it holds up to the error of the bicubic. The error is measured wherever an interval is halved
 and in every row, and the tests keep clear of it. A cell that is open at the narrowest interval
-counts as suspicious. A second count knows nothing of cells: G(theta2, 0) does not go round zero, so
-that the signs of all zeros must add up to the winding number of p at the last time as theta2 goes
-once round.
+counts as suspicious. A second count knows nothing of cells: how often G at t = 0 goes round zero is
+known, so that the signs of all zeros must add up to the winding number of G at the last time as the
+angle goes once round, but for that.
 
 In natural units, and in NumPy but for the lanes.
 """
@@ -38,7 +40,7 @@ from dpend.catalogue.bicubic import (
     largest_nearby,
     turn_along,
 )
-from dpend.catalogue.rows import TooCoarse, release_rows, rows_for
+from dpend.catalogue.rows import Circle, TooCoarse, rows_for
 from dpend.mechanics.linear import fast_frequency
 from dpend.mechanics.pendulum import Pendulum
 
@@ -52,12 +54,12 @@ _MOST_ROWS = 8192
 # Rows are too coarse if a cell that may hold a zero has an error along time above this share of its
 # height.
 _COARSE = 0.02
-# The intervals of theta2 whose motions foretell the cost of a search.
+# The intervals of the angle whose motions foretell the cost of a search.
 _PROBES = 128
 # The share of the steepest intervals. Waves are counted with and without them, and the geometric
 # mean is taken: the first is up to a hundred times too large, the second four times too small.
 _STEEPEST = 0.05
-# The motions that a wave of p along theta2 costs: 8 to 46 over 30 slices of three pendulums.
+# The motions that a wave of G along the angle costs: 8 to 46 over 30 slices of three pendulums.
 MOTIONS_PER_WAVE = 20
 # The returns to a wave: 2 to 7 over the same slices.
 RETURNS_PER_WAVE = 3
@@ -101,18 +103,18 @@ class Budget:
 
 
 class Outlook(NamedTuple):
-    """What a scan has before it: rows of each motion, and waves that p makes along theta2."""
+    """What a scan has before it: rows of each motion, and waves that G makes along the angle."""
 
     rows: int
     waves: float
 
 
 class Zero(NamedTuple):
-    """A return to rest: the release, the time, the sign of the Jacobian of (p1, p2) in (theta2, t),
-    and the width in theta2 and the time between rows of the cell that it was found in.
+    """A return: the start, the time, the sign of the Jacobian of G in (angle, t), and the width in
+    the angle and the time between rows of the cell that it was found in.
     """
 
-    theta2: float
+    angle: float
     time: float
     sign: float
     width: float
@@ -124,13 +126,13 @@ class Scan:
     """All zeros on the rectangle.
 
     Attributes:
-        zeros: in order of theta2.
+        zeros: in order of the angle.
         motions: how many were integrated.
         rows: how many times each was looked at.
-        open_cells: (theta2, width) of intervals that were left undecided: too narrow to halve,
+        open_cells: (angle, width) of intervals that were left undecided: too narrow to halve,
             beyond the budget, or not finite.
-        winding: of p at the last time as theta2 goes round, clockwise: the way round the rectangle
-            that keeps it left.
+        winding: of G round the rectangle, which is kept left: clockwise at the last time as the
+            angle goes round, and anticlockwise at t = 0.
         exhausted: whether the budget ended the search.
     """
 
@@ -147,34 +149,31 @@ class Scan:
         return round(sum(zero.sign for zero in self.zeros))
 
 
-def scan_release(
-    pendulum: Pendulum, theta1: float, duration: float, intervals: int, budget: Budget
-) -> Scan:
-    """All returns to rest up to `duration`, from so many intervals of theta2 to begin with.
+def scan_circle(circle: Circle, duration: float, intervals: int, budget: Budget) -> Scan:
+    """All returns up to `duration`, from so many intervals of the angle to begin with.
 
     Arguments:
-        pendulum: in natural units, its fields numbers; so is the duration, at most `longest`.
-        theta1: [rad].
+        duration: in natural units, at most `longest`.
         budget: what the scan, and others, may spend.
     """
-    rows = rows_for(pendulum, duration)
+    rows = rows_for(circle.pendulum, duration)
     while 2 * rows <= _MOST_ROWS:
         try:
-            return _Scanner(pendulum, theta1, duration / rows, rows, False, budget).run(intervals)
+            return _Scanner(circle, duration / rows, rows, False, budget).run(intervals)
         except TooCoarse:
             rows *= 2
-    return _Scanner(pendulum, theta1, duration / rows, rows, True, budget).run(intervals)
+    return _Scanner(circle, duration / rows, rows, True, budget).run(intervals)
 
 
-def foresee(pendulum: Pendulum, theta1: float, duration: float) -> Outlook:
-    """What `scan_release` will take: from the slopes of a few motions, without looking for returns.
+def foresee(circle: Circle, duration: float) -> Outlook:
+    """What `scan_circle` will take: from the slopes of a few motions, without looking for returns.
 
-    The slope's mean over theta2, against the usual size of p, is the number of waves. It grows like
-    the distance of neighbouring motions, and intervals must be as narrow as the waves.
+    The slope's mean over the angle, against the usual size of G, is the number of waves. It grows
+    like the distance of neighbouring motions, and intervals must be as narrow as the waves.
     """
-    rows = rows_for(pendulum, duration)
+    rows = rows_for(circle.pendulum, duration)
     probes = np.linspace(-np.pi, np.pi, _PROBES + 1)
-    value, _, slope, _ = release_rows(pendulum, theta1, duration / rows, rows, probes, True)
+    value, _, slope, _ = circle.rows(duration / rows, rows, probes, True)
     with np.errstate(all="ignore"):
         size, steep = (np.nan_to_num(np.hypot(*each)[1:], posinf=0.0) for each in (value, slope))
         steep = np.sort(steep / np.median(size, axis=1)[:, None], axis=1)
@@ -192,8 +191,7 @@ def longest(pendulum: Pendulum) -> float:
 class _Scanner:
     """The rectangle and its rows."""
 
-    pendulum: Pendulum
-    theta1: float
+    circle: Circle
     dt: float
     rows: int
     coarse: bool  # whether rows too far apart are put up with
@@ -230,6 +228,7 @@ class _Scanner:
                 turned += turn_along(settled)
             motions += len(some.left)
         winding = round(turned / (2 * np.pi)) if math.isfinite(turned) else 0
+        winding += self.circle.turns
         spent = self.budget.exhausted
         return Scan(
             _distinct(zeros, self.dt), motions, self.rows + 1, tuple(open_cells), winding, spent
@@ -250,10 +249,10 @@ class _Scanner:
             *(np.concatenate(columns, axis=-1) for columns in zip(*parts, strict=True))
         )
 
-    def motions(self, theta2: np.ndarray) -> np.ndarray:
-        """G of the motions released at (theta1, theta2), shape (4, 2, rows + 1, n)."""
-        self.budget.spend(self.rows * theta2.size)
-        return release_rows(self.pendulum, self.theta1, self.dt, self.rows, theta2, self.coarse)
+    def motions(self, angles: np.ndarray) -> np.ndarray:
+        """G of the motions that start at these angles, shape (4, 2, rows + 1, n)."""
+        self.budget.spend(self.rows * angles.size)
+        return self.circle.rows(self.dt, self.rows, angles, self.coarse)
 
     def _halve(self, some: Intervals) -> "tuple[Half, Half]":
         """Both halves of all intervals; their error is how far the cubics miss the middles."""
@@ -289,9 +288,9 @@ class _Scanner:
                 kind = cells.classify()
             whole = cells.whole[kind.simple]
             width = (some.right - some.left)[lane[whole]]
-            theta2 = some.left[lane[whole]] + kind.where[0] * width
+            angle = some.left[lane[whole]] + kind.where[0] * width
             time = self.dt * (row[whole] + cells.start[kind.simple] + kind.where[1] / 2**split)
-            table = np.stack([theta2, time, kind.sign, width, np.full_like(time, self.dt)], axis=1)
+            table = np.stack([angle, time, kind.sign, width, np.full_like(time, self.dt)], axis=1)
             inside = np.all((kind.where > -_EDGE) & (kind.where < 1 + _EDGE), axis=0) & (
                 time <= self.dt * self.rows
             )
@@ -329,11 +328,11 @@ def _places(some: Intervals) -> list[tuple[float, float]]:
 
 
 def _distinct(zeros: list[Zero], dt: float) -> tuple[Zero, ...]:
-    """In order of theta2 in (-pi, pi], each once."""
+    """In order of the angle in (-pi, pi], each once."""
     kept: list[Zero] = []
     for zero in sorted(zeros, key=lambda zero: zero.time):
-        theta2 = zero.theta2 - 2 * np.pi * math.ceil(zero.theta2 / (2 * np.pi) - 0.5 - 1e-12)
-        zero = zero._replace(theta2=theta2)
+        angle = zero.angle - 2 * np.pi * math.ceil(zero.angle / (2 * np.pi) - 0.5 - 1e-12)
+        zero = zero._replace(angle=angle)
         if not _is_among(kept, zero, dt):
             kept.append(zero)
     return tuple(sorted(kept))
@@ -344,7 +343,7 @@ def _is_among(kept: list[Zero], zero: Zero, dt: float) -> bool:
     for other in reversed(kept):
         if zero.time - other.time >= _SAME * dt:
             return False
-        apart = abs(math.remainder(other.theta2 - zero.theta2, 2 * np.pi))
+        apart = abs(math.remainder(other.angle - zero.angle, 2 * np.pi))
         if apart < _SAME * max(zero.width, other.width) and other.sign == zero.sign:
             return True
     return False

@@ -215,13 +215,13 @@ class _Survey:
         zeros = sorted(result.zeros, key=lambda zero: zero.time)
         found = Slice(
             result.motions, result.rows, len(result.open_cells), result.winding, result.degree,
-            [[zero.theta2, 2 * zero.time] for zero in zeros],
+            [[zero.angle, 2 * zero.time] for zero in zeros],
         )  # fmt: skip
         for zero in zeros:
             if self.budget.exhausted:
                 return
             if 2 * zero.time <= self.max_period and not self._belongs(
-                theta1, zero.theta2, 2 * zero.time
+                theta1, zero.angle, 2 * zero.time
             ):
                 found.lost += not self._follow(theta1, zero, level)
         if not self.budget.exhausted:
@@ -240,7 +240,7 @@ class _Survey:
 
     def _follow(self, theta1: float, zero: Zero, level: int) -> bool:
         """Follows the family of a return; whether that worked."""
-        seed = theta1, zero.theta2, 2 * zero.time
+        seed = theta1, zero.angle, 2 * zero.time
         orbit = find_orbit(self.pendulum, theta1, guess=seed[1:])
         if int(orbit.status) != Status.CONVERGED or not is_return(orbit, zero):
             return False

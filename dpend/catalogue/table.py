@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from dpend.mechanics.pendulum import Pendulum, released
-from dpend.orbits.arc import SEGMENTS
-from dpend.orbits.orbit import RELEASED_SYMMETRIES, PeriodicOrbit
+from dpend.orbits.arc import RELEASED_SYMMETRIES, SEGMENTS
+from dpend.orbits.orbit import PeriodicOrbit
 from dpend.status import Status
 
 # The energy of the release against the orbit's, in units of the weights' torques. The difference is

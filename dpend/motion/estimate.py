@@ -1,5 +1,5 @@
-"""How far a computed motion is from the true one: two passes compared, rounding and its growth
-included; and the step that reaches a tolerance (`find_scheme`).
+"""How far a motion at given steps is from the true one: two passes compared, rounding and its
+growth included.
 """
 
 from dataclasses import replace

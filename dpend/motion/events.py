@@ -1,9 +1,9 @@
 """The first time at which a function of the state crosses zero, exact to the integration method.
 
-1. The motion goes step by step (`_Watch.look`). Two signs send the search into a step: a function
+1. The motion goes step by step (`Watch.look`). Two signs send the search into a step: a function
    changes its sign in it, or a parabola through its values at the ends of the last two steps comes
    near zero in it, so that the function may have crossed twice.
-2. In that step (`_Watch.settle`) each such function is followed by a probe (`root`). It takes the
+2. In that step (`Watch.settle`) each such function is followed by a probe (`root`). It takes the
    step again from the state before it, as a step of the same method of another length: there is no
    interpolant with an error of its own. The probe keeps a bracket of the change of sign, so that it
    ends with a root, or with nothing (the function jumps, has a pole, or turns back before zero).
@@ -165,7 +165,7 @@ def _first_crossing(
     scheme: Scheme,
     direction: int,
 ) -> Crossing:
-    watch = _Watch(functions, pendulum, scheme, direction)
+    watch = Watch(functions, pendulum, scheme, direction)
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), state)
     step = -scheme.step if duration < 0 else scheme.step
     start, zeros = watch.start(state, step)
@@ -190,7 +190,7 @@ def _pick(items: Sequence[Any], index: Scalar) -> Any:
     )
 
 
-class _Watch(NamedTuple):
+class Watch(NamedTuple):
     """What is asked for, and of which motion."""
 
     functions: Callable[[Pendulum, State], Any]
@@ -207,8 +207,12 @@ class _Watch(NamedTuple):
         of their values.
         """
         moves = [dt * slope for slope in jax.tree.leaves(vector_field(self.pendulum, state))]
-        pairs = zip(jax.tree.leaves(state), moves, strict=True)
-        sizes = [jnp.abs(x) + jnp.abs(move) for x, move in pairs]
+        # Both velocities are differences of the same terms, and so are both forces: where one is
+        # small, the rounding of the other's terms is in it.
+        theta1, theta2, p1, p2 = (jnp.abs(move) for move in moves)
+        largest = (theta1 + theta2,) * 2 + (p1 + p2,) * 2
+        pairs = zip(jax.tree.leaves(state), largest, strict=True)
+        sizes = [jnp.abs(x) + move for x, move in pairs]
         measures = []
         for value, gradient in zip(self.values(state), jax.jacfwd(self.values)(state), strict=True):
             parts = jax.tree.leaves(gradient)

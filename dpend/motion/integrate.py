@@ -26,7 +26,7 @@ _CHECKPOINT_ABOVE = 1024
 # A step of the rescaled method that is this much shorter than it may be belongs to a rod that turns
 # ten thousand times as fast as any that gravity moves: the lane is given up as NaN, so that no
 # other waits for it.
-_SHORTEST_STEP = 1e-5
+SHORTEST_STEP = 1e-5
 
 
 def march(
@@ -156,6 +156,16 @@ def _show_step(
     return _Along(point, tangents, carry)
 
 
+def step_for(longest: Scalar, spin: Scalar, before: Scalar) -> Scalar:
+    """The length [s] of the rescaled method's step from a point with u = `spin`.
+
+    Between the step's start and its end u is not yet known: its ratio to the one `before`, a step
+    ago, tells where it goes.
+    """
+    root = jnp.sqrt(jnp.maximum(spin * (spin / before), 1.0))
+    return longest / (root * jnp.sqrt(jnp.sqrt(root)))
+
+
 @custom_vmap
 def _any_lane(going: Scalar) -> Scalar:
     """Whether any lane goes on: a loop's condition that under `vmap` is one for all lanes, so that
@@ -192,11 +202,8 @@ def _march_unevenly(
     def advance(work: tuple[_Along, Scalar, Scalar]) -> tuple[_Along, Scalar, Scalar]:
         along, time, before = work
         spin = scheme.spin(unit, along.point)
-        # Between this step's start and its end u is not yet known: the last step's ratio tells
-        # where it goes.
-        root = jnp.sqrt(jnp.maximum(spin * (spin / before), 1.0))
-        dt = longest / (root * jnp.sqrt(jnp.sqrt(root)))
-        lost = ~(dt >= _SHORTEST_STEP * longest)  # also where it is not a number
+        dt = step_for(longest, spin, before)
+        lost = ~(dt >= SHORTEST_STEP * longest)  # also where it is not a number
         rest, live = duration - time, goes(time)
         last = dt >= sense * rest
         dt = jnp.where(lost, jnp.nan, jnp.where(last, rest, sense * dt))

@@ -1,10 +1,10 @@
 """Multiple shooting: a symmetric orbit in segments, and the step from one orbit of a family to the
 next.
 
-A quarter (centred) or half (brake, odd) of the period is cut into segments that are integrated side
-by side, each from its own initial state, the node; Newton's method makes their ends meet. No
-segment is long enough for the motion to forget where it began, so that orbits can be followed to
-where kappa is 1e40 and shooting in one piece would see noise.
+A quarter (centred), a half (brake, odd, passing) or the whole of the period (none) is cut into
+segments that are integrated side by side, each from its own initial state, the node; Newton's
+method makes their ends meet. No segment is long enough for the motion to forget where it began, so
+that orbits can be followed to where kappa is 1e40 and shooting in one piece would see noise.
 
 The duration of a segment is Delta/rate(node): every segment is given the same share Delta of the
 fastest motion, and that makes the mesh follow the orbit smoothly, without ever being laid anew.
@@ -15,6 +15,7 @@ Everything here is in natural units, l1 = m1 = g = 1: a pendulum is then (l2/l1,
 scaling laws hold to the last digit.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -34,9 +35,11 @@ from dpend.orbits.stability import transition
 SEGMENTS = 16
 UNKNOWNS = 4 * SEGMENTS + 2
 # The conditions at the ends of the arc, by symmetry; the index is what compiled code is told.
-SYMMETRIES = ("centred", "brake", "odd")
+SYMMETRIES = ("centred", "brake", "odd", "passing", "none")
+PASSING, NONE = SYMMETRIES.index("passing"), SYMMETRIES.index("none")
+RELEASED_SYMMETRIES = ("centred", "brake")
 # What part of the period the arc is.
-PARTS = {"centred": 4, "brake": 2, "odd": 2}
+PARTS = {"centred": 4, "brake": 2, "odd": 2, "passing": 2, "none": 1}
 
 # Only its method is used: the number of steps is settled arc by arc. With its stages as a loop it
 # takes twice the time, and a tenth of it to compile.
@@ -47,13 +50,13 @@ TURN = 0.14
 MOST_SEGMENT_STEPS = 5_000
 
 # Where the unknowns are: the nodes one after the other, log Delta, and the unfolding parameter of
-# odd orbits, which is zero on every orbit.
+# odd orbits and of those without symmetry, which is zero on every orbit.
 LOG_DELTA, UNFOLDING = 4 * SEGMENTS, 4 * SEGMENTS + 1
 
 
 class Arc(NamedTuple):
-    """What is asked of an arc: the index of its symmetry, and the full turns of its end (theta/pi
-    if centred, else theta(0) + theta(T/2) in units of 2 pi).
+    """What is asked of an arc: the index of its symmetry, and the turns of its end (theta/pi if
+    centred or passing; in units of 2 pi theta(0) + theta(T/2) if odd, theta(T) - theta(0) if none).
     """
 
     symmetry: Any
@@ -151,33 +154,60 @@ def end_conditions(
     - odd: x(T/2) = -x(0) up to full turns, where the upper rod is at its extreme, theta1' = 0.
       Energy is conserved, so that these are one too many for the period and the state; the
       unfolding parameter times grad H, added to them, is zero at every solution (Munoz-Almaraz et
-      al., Physica D 181 (2003)).
+      al., Physica D 181 (2003));
+    - passing: theta(0) = 0 modulo pi, theta(T/2) = pi turns;
+    - none: x(T) = x(0) but for full turns, unfolded as odd orbits are, where the potential energy V
+      is at an extreme, theta' . grad V = 0: every periodic orbit has such a place.
     """
     full_turns = jnp.append(2 * jnp.pi * arc.turns, jnp.zeros(2))
 
-    def gradient_and_rate(start: Array) -> Array:
+    def gradient_and_power(start: Array) -> Array:
         slope = _field(pendulum, State(*start))
-        return jnp.concatenate([-slope[2:], slope[:2]])
+        pull = _field(pendulum, State(*start[:2], *jnp.zeros(2)))[2:]  # -grad V
+        return jnp.concatenate([-slope[2:], slope[:2], -(slope[:2] @ pull)[None]])
 
-    gradient, curvature = gradient_and_rate(start), jax.jacfwd(gradient_and_rate)(start)
+    gradient, power = jnp.split(gradient_and_power(start), [4])
+    curvature, change = jnp.split(jax.jacfwd(gradient_and_power)(start), [4])
+    by_end = unfolding * curvature, jnp.eye(4), gradient
+
+    def unfolded(sign: float, phase: Array) -> Array:
+        """The derivative of end + sign start + unfolding gradient, and of the phase."""
+        rows = jnp.column_stack([sign * jnp.eye(4) + by_end[0], *by_end[1:]])
+        return jnp.concatenate([rows, jnp.append(phase, jnp.zeros(5))[None]])
+
     value = jnp.stack([
         jnp.concatenate([start[2:], end[:2] - jnp.pi * arc.turns, unfolding[None]]),
         jnp.concatenate([start[2:], end[2:], unfolding[None]]),
         jnp.append(end + start - full_turns + unfolding * gradient, gradient[2]),
+        jnp.concatenate([_from_centre(start), end[:2] - jnp.pi * arc.turns, unfolding[None]]),
+        jnp.append(end - start - full_turns + unfolding * gradient, power),
     ])  # fmt: skip
-    odd = jnp.column_stack([jnp.eye(4) + unfolding * curvature, jnp.eye(4), gradient])
-    odd = jnp.concatenate([odd, jnp.append(curvature[2], jnp.zeros(5))[None]])
-    derivative = jnp.stack([jnp.asarray(_AT_REST["centred"]), jnp.asarray(_AT_REST["brake"]), odd])
-    return value[arc.symmetry], derivative[arc.symmetry]
+    derivative = {
+        **{name: jnp.asarray(rows) for name, rows in _LINEAR.items()},
+        "odd": unfolded(1.0, curvature[2]),
+        "none": unfolded(-1.0, change[0]),
+    }
+    return value[arc.symmetry], jnp.stack([derivative[name] for name in SYMMETRIES])[arc.symmetry]
+
+
+def _from_centre(start: Array) -> Array:
+    """theta from the nearest place of {0, pi}^2 up to full turns: a passing orbit's start stays
+    there all along its family, so that the nearest is known.
+    """
+    return start[:2] - jnp.pi * jnp.round(start[:2] / jnp.pi)
 
 
 def _rows(*columns: int) -> np.ndarray:
     return np.eye(9)[list(columns)]
 
 
-# The derivatives of the conditions of orbits released from rest: of p(0), of theta or p at the end,
+# The derivatives of the conditions that are linear: of p(0) or theta(0), of theta or p at the end,
 # of the unfolding.
-_AT_REST = {"centred": _rows(2, 3, 4, 5, 8), "brake": _rows(2, 3, 6, 7, 8)}
+_LINEAR = {
+    "centred": _rows(2, 3, 4, 5, 8),
+    "brake": _rows(2, 3, 6, 7, 8),
+    "passing": _rows(0, 1, 4, 5, 8),
+}
 
 # L and U in one matrix, and the order of the rows: what `lax.linalg.lu` has found already, and
 # `lu_solve` finds anew.
@@ -201,6 +231,31 @@ def solve_transposed(factors: Factors, right: Array) -> Array:
     return jnp.zeros_like(right).at[order].set(whole)
 
 
+def _state_at(pendulum: Pendulum, times: Array, states: Array, time: Scalar) -> Array:
+    """The state of a motion at a time from the last one before it that is known."""
+    # As many steps as rates of four times the linear motion's need: an arc will be corrected.
+    rate = 4 * fast_frequency(pendulum) * jnp.sqrt(1 + pendulum.m2)
+    nearest = jnp.searchsorted(times, time, side="right") - 1
+    rest = time - times[nearest]
+    steps = jnp.clip(jnp.ceil(rest * rate / TURN), 1, 100 * MOST_SEGMENT_STEPS).astype(int)
+    return stack_state(
+        advance_state(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps)
+    )
+
+
+def state_halfway(pendulum: Pendulum, point: Array) -> Array:
+    """The state at half of the arc's time, from a point's nodes."""
+    times, _ = arc_times(pendulum, point)
+    starts = jnp.append(0.0, jnp.cumsum(times)[:-1])
+    return _state_at(pendulum, starts, point[:LOG_DELTA].reshape(SEGMENTS, 4), 0.5 * jnp.sum(times))
+
+
+@jax.jit
+def states_on_arc(pendulum: Pendulum, times: Array, states: Array, wanted: Array) -> Array:
+    """The states at wanted times, rows of four, of a motion of which some are known."""
+    return jax.vmap(partial(_state_at, pendulum, times, states))(wanted)
+
+
 @jax.jit
 def lay_arc(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -> Array:
     """Nodes and log Delta of an arc of `duration` on an orbit of which some states are known.
@@ -208,17 +263,9 @@ def lay_arc(pendulum: Pendulum, times: Array, states: Array, duration: Scalar) -
     Arguments:
         times, states: known ones in order of time, beginning with (0, x(0)).
     """
-    # As many as rates of four times the linear motion's need: what is laid will be corrected.
-    rate = 4 * fast_frequency(pendulum) * jnp.sqrt(1 + pendulum.m2)
 
     def state_at(time: Scalar) -> Array:
-        time = jnp.clip(time, 0.0, duration)
-        nearest = jnp.searchsorted(times, time, side="right") - 1
-        rest = time - times[nearest]
-        steps = jnp.clip(jnp.ceil(rest * rate / TURN), 1, 100 * MOST_SEGMENT_STEPS).astype(int)
-        return stack_state(
-            advance_state(METHOD, pendulum, State(*states[nearest]), step_size(rest, steps), steps)
-        )
+        return _state_at(pendulum, times, states, jnp.clip(time, 0.0, duration))
 
     def nodes(delta: Scalar) -> tuple[Scalar, Array]:
         def step(time: Scalar, _: None) -> tuple[Scalar, Array]:

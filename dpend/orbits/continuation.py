@@ -1,4 +1,4 @@
-"""Continuation: the family of a normal mode, of an orbit, or of the branch at a special point.
+"""Continuation: the family of an equilibrium, of an orbit, or of the branch at a special point.
 
 `follow_family` walks along the curve by pseudo-arclength, its orbits cut into segments (see `arc`),
 and finds where its stability changes, where it turns back and where others branch off; given such a
@@ -6,32 +6,35 @@ place, it follows the branch.
 """
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.checks import integer, known_number, known_real, known_value, single
-from dpend.mechanics.pendulum import Pendulum, check_pendulum
+from dpend.checks import integer, known_number, known_real, known_value
+from dpend.mechanics.pendulum import Pendulum
 from dpend.mechanics.units import natural
 from dpend.orbits.arc import PARTS
+from dpend.orbits.branching import branches_at
 from dpend.orbits.curve import (
     Curve,
     concatenate,
     curve_of,
     drop_mirror_half,
     half_of_closed,
+    release_columns,
     reversed_,
     way_to,
 )
 from dpend.orbits.family import Family, family_of
-from dpend.orbits.find import swinging_pendulum
-from dpend.orbits.follow import FamilyProblem, Reach, guess_arc, repeat_arc, start_at
+from dpend.orbits.find import swinging_numbers
+from dpend.orbits.follow import FamilyProblem, Reach, guess_arc, start_at
 from dpend.orbits.newton import METRIC, Solved
-from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
+from dpend.orbits.orbit import BRANCHES, FAMILIES, PeriodicOrbit
 from dpend.orbits.samples import SpecialPoint
-from dpend.orbits.walk import FIRST_STEP, LONGEST_STEP, start_at_mode
+from dpend.orbits.walk import FIRST_STEP, LONGEST_STEP, start_at_mode, start_at_saddle
 from dpend.status import Status
 
 _MOST_POINTS = 5000
@@ -57,34 +60,36 @@ def follow_family(
     Jacobian's determinant changes sign, which would be a jump to another curve. The family ends
     where the energy comes within 1e-8 of that of an equilibrium with a rod upright (in units of the
     weights' torques; the period then grows like its logarithm), where it is back at its beginning,
-    or at the hanging pendulum.
+    at an equilibrium, or where a hundred times these torques let the rods turn over freely.
 
     Arguments:
         pendulum: the derivatives of its leaves, if they carry any, reach what `Family.at` returns;
             `jit` around this does not work.
-        start: `in-phase` or `anti-phase`, the family of a normal mode; or an orbit, from which its
-            family is followed in both directions; or a special point, for the branch that leaves
-            there: at a loss or gain of stability of centred orbits with c = 1 the orbits with
-            x(T/2) = -x(0) that are no longer released from rest, with c = -1 those released from
-            rest that are no longer centred, at a resonance the brake orbits of k times the period.
+        start: `in-phase` or `anti-phase`, the family of a normal mode; `down-up` or `up-down`, that
+            of the saddle (0, pi) or (pi, 0), whose orbits swing about it and are unstable (the
+            Lyapunov orbits); or an orbit, from which its family is followed in both directions; or
+            a special point, for the branch that leaves there: at a loss or gain of stability of
+            centred orbits with c = 1 the orbits with x(T/2) = -x(0) that are no longer released
+            from rest, with c = -1 either those released from rest that are no longer centred or
+            those through the same place of {0, pi}^2 that never rest, at a resonance the brake (of
+            passing orbits the passing) orbits of k times the period.
         longest_step: in arclength; the default gives about a hundred points.
         longest_period: [s]; the family is followed to its first orbit of this period.
         most_points: on one side of the start.
     Raises:
         ValueError: an unknown name; g not positive; an orbit of another pendulum, or that has not
-            converged; a special point where nothing branches off, or only orbits (c = -1 in half of
-            the cases) that are centred no longer and never rest; longest_period below the period of
-            the first orbit.
+            converged; a special point where nothing branches off; longest_period below the period
+            of the first orbit.
         RuntimeError: float64 is switched off in JAX.
     See also: Doedel, Keller and Kernevez, Numerical analysis and control of bifurcation problems
     (1991); Peeters et
         al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
     """
     require_float64()
-    fixed = _primal(pendulum)
+    fixed = swinging_numbers(pendulum)
     if not isinstance(start, (str, PeriodicOrbit, SpecialPoint)):
         raise ValueError(
-            f"start must be one of {', '.join(BRANCHES)}, an orbit or a special point, got "
+            f"start must be one of {', '.join(FAMILIES)}, an orbit or a special point, got "
             f"{type(start).__name__}: "
             "give one of them"
         )
@@ -98,37 +103,28 @@ def follow_family(
     scaled = jax.tree.map(np.float64, natural(fixed))
     reach = Reach(step, most_points, period / math.sqrt(fixed.l1 / fixed.g))
     if isinstance(start, str):
-        if start not in BRANCHES:
+        if start not in FAMILIES:
             raise ValueError(
-                f"start must be one of {', '.join(BRANCHES)}, or an orbit, got {start!r}: give one"
+                f"start must be one of {', '.join(FAMILIES)}, or an orbit, got {start!r}: give one"
             )
-        return _from_mode(FamilyProblem(pendulum, scaled, "centred", (0.0, 0.0)), start, reach)
+        centre = _CENTRES.get(start, (0.0, 0.0))
+        return _from_mode(FamilyProblem(pendulum, scaled, "centred", centre), start, reach)
     if isinstance(start, SpecialPoint):
         return _from_branch_point(pendulum, start, reach)
     return _from_orbit(pendulum, scaled, start, reach)
 
 
-def _primal(pendulum: Any) -> Pendulum:
-    """The numbers behind a pendulum, also under eager differentiation, whose derivatives
-    `Family.at` carries on.
-
-    Raises:
-        ValueError: no pendulum; a field that is an array or traced by `jit`; g not positive.
-    """
-    check_pendulum(pendulum)
-    numbers = {}
-    for name, leaf in vars(pendulum).items():
-        single(name, leaf)
-        known = known_value(leaf)
-        numbers[name] = leaf if known is None else known
-    return swinging_pendulum(Pendulum(**numbers))  # which refuses what `jit` traces
-
-
-_beginning = jax.jit(start_at_mode)
+_at_mode, _at_saddle = jax.jit(start_at_mode), jax.jit(start_at_saddle)
+# Where the motions of the saddles' families pass, in units of pi.
+_CENTRES = {"down-up": (0.0, 1.0), "up-down": (1.0, 0.0)}
 
 
 def _from_mode(problem: FamilyProblem, branch: str, reach: Reach) -> Family:
-    start = jax.tree.map(np.asarray, _beginning(problem.natural, branch == "in-phase"))
+    if branch in BRANCHES:
+        begin = _at_mode(problem.natural, branch == "in-phase")
+    else:
+        begin = _at_saddle(problem.natural, branch == "up-down")
+    start = jax.tree.map(np.asarray, begin)
     rows, end = problem.follow_curve(start, None, reach)
     if not len(rows.point):
         raise _too_short(reach)
@@ -150,7 +146,7 @@ def _too_short(reach: Reach) -> ValueError:
 
 
 def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reach: Reach) -> Family:
-    fixed = _primal(pendulum)
+    fixed = swinging_numbers(pendulum)
     orbit = _known_orbit(fixed, orbit)
     second = math.sqrt(fixed.l1 / fixed.g)
     momentum = fixed.m1 * fixed.l1**2 / second
@@ -158,9 +154,12 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reac
         np.array([x.theta1, x.theta2, x.p1 / momentum, x.p2 / momentum], np.float64)
         for x in (orbit.state, orbit.dual)
     )
+    own = np.array(orbit.turns, np.float64)
     turns = {
-        "centred": np.array(orbit.turns, np.float64),
+        "centred": own,
         "odd": np.round((state + dual)[:2] / (2 * np.pi)),
+        "passing": np.round(dual[:2] / np.pi),
+        "none": own,
     }
     symmetry = orbit.symmetry
     full = turns.get(symmetry, np.zeros(2))
@@ -170,7 +169,8 @@ def _from_orbit(pendulum: Pendulum, scaled: Pendulum, orbit: PeriodicOrbit, reac
     duration = float(orbit.period) / second / PARTS[symmetry]
     point = guess_arc(problem, np.zeros(1), state[None], duration)
     rows = problem.on_curve(point)
-    if rows is None or np.linalg.norm(way_to(rows.point[0, :2], state[:2])) > _SAME_ORBIT:
+    first = release_columns(symmetry)
+    if rows is None or np.linalg.norm(way_to(rows.point[0, first], state[first])) > _SAME_ORBIT:
         raise ValueError(
             "start must be an orbit whose motion is still known at the end of its arc: give "
             "another one"
@@ -208,8 +208,8 @@ def _both_ways(problem: FamilyProblem, rows: Solved, reach: Reach) -> Family:
         return _closed(problem, rows, ahead)
     behind, begin = problem.follow_curve(start._replace(tangent=-start.tangent), rows, reach)
     whole, ends, here = concatenate(reversed_(behind), rows, ahead), (begin, end), len(behind.point)
-    if problem.symmetry == "brake":
-        whole, ends = drop_mirror_half(whole, ends, here)
+    if problem.symmetry in ("brake", "passing"):
+        whole, ends = drop_mirror_half(whole, ends, here, problem.symmetry)
     return family_of(problem, whole, curve_of(whole), ends)
 
 
@@ -217,8 +217,9 @@ def _closed(problem: FamilyProblem, start: Solved, ahead: Solved) -> Family:
     """A curve that comes back to its beginning: to the same rest, which is then its last point too,
     or to the other.
     """
-    rows, ends = concatenate(start, ahead), ("closed", "closed")
-    if problem.symmetry == "brake" and (half := half_of_closed(rows)) is not None:
+    rows, ends, symmetry = concatenate(start, ahead), ("closed", "closed"), problem.symmetry
+    half = half_of_closed(rows, symmetry) if symmetry in ("brake", "passing") else None
+    if half is not None:
         rows, ends = half, ("branch point", "branch point")
     elif (
         np.sqrt(np.sum(METRIC * (ahead.point[-1] - start.point[0]) ** 2))
@@ -229,18 +230,18 @@ def _closed(problem: FamilyProblem, start: Solved, ahead: Solved) -> Family:
 
 
 def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) -> Family:
-    symmetry, k = _branch_at(special)
-    base = special._place
-    half = float(base.rows.times[0].sum()) * PARTS[base.problem.symmetry] / 2
-    duration = k * half * 2 / PARTS[symmetry]
-    turns = base.problem.turns if symmetry != "brake" else (0.0, 0.0)
-    problem = FamilyProblem(pendulum, base.problem.natural, symmetry, turns)
-    point = guess_arc(problem, *repeat_arc(base.problem, base.rows, k), duration)
-    sides = []
+    base, (symmetry, k) = special._place, _branch_at(special)
+    sides: list[tuple[Solved, str]] = []
+    for problem, point, moving in branches_at(base, symmetry, k):
+        problem = replace(problem, pendulum=pendulum)
+        if problem.onto_branch(moving, point, 1.0) is not None:
+            break
+    else:
+        raise _no_branch(special)
     for sign in (1.0, -1.0):
-        rows = problem.onto_branch(base.rows, point, sign)
+        rows = problem.onto_branch(moving, point, sign)
         if rows is None:
-            raise _no_branch(special, (symmetry, k))
+            raise _no_branch(special)
         if problem.period(rows)[0] > reach.period:
             raise _too_short(reach)
         start = start_at(rows.point[0], rows.tangent[0], min(FIRST_STEP, reach.step), rows.steps[0])
@@ -248,8 +249,8 @@ def _from_branch_point(pendulum: Pendulum, special: SpecialPoint, reach: Reach) 
         if end == "closed":
             return _closed(problem, rows, ahead)
         sides.append((concatenate(rows, ahead), end))
-        if symmetry != "centred":
-            break  # the other side holds the same orbits, at their other rest or in the mirror
+        if problem.symmetry != base.problem.symmetry or k % 2 == 0:
+            break  # the other side holds the same orbits, half a period later or in the mirror
     (one, end), other = sides[0], sides[1:]
     if other:
         rows = concatenate(reversed_(other[0][0]), one)
@@ -275,12 +276,8 @@ def _branch_at(special: SpecialPoint) -> tuple[str, int]:
     return special._branch
 
 
-def _no_branch(special: SpecialPoint, branch: tuple[str, int]) -> ValueError:
-    # At c = -1 either C loses rank, and orbits at rest branch off, or B vanishes, and they pass
-    # through theta in {0, pi}^2 at T/4 and at 3 T/4 without ever resting.
-    never = branch == ("brake", 1)
-    why = "whose orbits are never at rest" if never else "without one nearby"
+def _no_branch(special: SpecialPoint) -> ValueError:
     return ValueError(
         f"start must be a point where a family that can be followed branches off, got "
-        f"{special.kind} {why}"
+        f"{special.kind} without one nearby"
     )

@@ -59,41 +59,41 @@ def cut_at_return(rows: Solved, count: int) -> tuple[Solved, str]:
 
 
 def drop_mirror_half(
-    rows: Solved, ends: tuple[str, str], here: int
+    rows: Solved, ends: tuple[str, str], here: int, symmetry: str
 ) -> tuple[Solved, tuple[str, str]]:
-    """The part of a curve of brake orbits with the point `here` that does not hold them a second
-    time, and its ends.
+    """The part of a curve of brake or passing orbits with the point `here` that does not hold them
+    a second time, and its ends.
 
     Through a branch point, where its orbits become more symmetric ones, a curve goes on with the
-    same orbits, met at their other rests.
+    same orbits, met half a period later.
     """
     (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
     for i in crossings.tolist():
-        if not _reflects(rows, i):
+        if not _reflects(rows, i, symmetry):
             continue
         if here <= i:
-            return drop_mirror_half(select(rows, slice(i + 1)), (ends[0], "branch point"), here)
-        return drop_mirror_half(
-            select(rows, slice(i + 1, None)), ("branch point", ends[1]), here - i - 1
-        )
+            before = select(rows, slice(i + 1))
+            return drop_mirror_half(before, (ends[0], "branch point"), here, symmetry)
+        after = select(rows, slice(i + 1, None))
+        return drop_mirror_half(after, ("branch point", ends[1]), here - i - 1, symmetry)
     return rows, ends
 
 
-def half_of_closed(rows: Solved) -> Solved | None:
+def half_of_closed(rows: Solved, symmetry: str) -> Solved | None:
     """Of a closed curve that holds its orbits twice, from a branch point to another and back, the
     half it begins in.
     """
     (crossings,) = np.nonzero(rows.side[:-1] != rows.side[1:])
-    if crossings.size < 2 or not _reflects(rows, crossings[0]):
+    if crossings.size < 2 or not _reflects(rows, crossings[0], symmetry):
         return None
     return concatenate(
         select(rows, slice(crossings[-1] + 1, None)), select(rows, slice(crossings[0] + 1))
     )
 
 
-def _reflects(rows: Solved, crossing: Any) -> bool:
-    """Whether the points on both sides of a crossing are each other's images: their orbits' other
-    rests, in the mirror or not.
+def _reflects(rows: Solved, crossing: Any, symmetry: str) -> bool:
+    """Whether the points on both sides of a crossing are each other's images: their orbits half a
+    period later, in the mirror or not.
     """
     shorter, longer = sorted(
         (select(rows, slice(crossing + 1)), select(rows, slice(crossing + 1, None))),
@@ -102,9 +102,10 @@ def _reflects(rows: Solved, crossing: Any) -> bool:
     if len(shorter.point) < LEAVING:
         return False
     at = len(shorter.point) // 2  # far from the branch point, where all is close to all
-    curve = release_and_time(longer)
+    curve = release_and_time(longer, symmetry)
     for sign in (1.0, -1.0):
-        image = np.append(sign * shorter.end[at, :2], release_and_time(shorter)[at, 2])
+        end = sign * shorter.end[at, release_columns(symmetry)]
+        image = np.append(end, release_and_time(shorter, symmetry)[at, 2])
         away, lengths = away_from(curve[:-1], curve[1:], image)
         nearest = int(np.argmin(away))
         if away[nearest] < _IMAGE * lengths[nearest]:
@@ -118,14 +119,24 @@ _IMAGE = 0.05
 _MIDDLE = 0.1
 
 
-def release_and_time(rows: Solved) -> np.ndarray:
-    """(theta1, theta2, log of the time), which tell orbits of one symmetry apart."""
-    return np.concatenate([rows.point[:, :2], np.log(rows.times.sum(axis=1))[:, None]], axis=1)
+def release_columns(symmetry: str) -> slice:
+    """Which coordinates of a first state tell orbits of one symmetry apart: the angles, of passing
+    orbits the momenta.
+    """
+    return slice(2, 4) if symmetry == "passing" else slice(2)
+
+
+def release_and_time(rows: Solved, symmetry: str) -> np.ndarray:
+    """(theta1, theta2, log of the time), with momenta in the place of angles if passing."""
+    first = rows.point[:, release_columns(symmetry)]
+    return np.concatenate([first, np.log(rows.times.sum(axis=1))[:, None]], axis=1)
 
 
 def way_to(where: np.ndarray, release: np.ndarray) -> np.ndarray:
     """From one (theta1, theta2, log of the time) to the other, angles modulo 2 pi; shape (...,
     3).
+
+    Momenta are taken modulo 2 pi too: where two curves then seem to meet, `Family` looks closer.
     """
     way = release - where
     way[..., :2] -= 2 * np.pi * np.round(way[..., :2] / (2 * np.pi))

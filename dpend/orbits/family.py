@@ -6,25 +6,19 @@ any release angle on it.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from dpend.checks import (
-    Scalar,
-    integer,
-    numbers,
-    real,
-)
-from dpend.orbits.curve import (
-    Curve,
-)
+from dpend.checks import Scalar, at_most_one, integer, known_value, numbers, real
+from dpend.orbits.curve import Curve
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.newton import METRIC, Solved
-from dpend.orbits.orbit import PeriodicOrbit, Slopes, mirrored, orbits_of, slopes_of
+from dpend.orbits.orbit import Held, PeriodicOrbit, Slopes, mirrored, orbits_of, slopes_of
+from dpend.orbits.passages import LEVELS, angle_passages, level_passages, onto_level
 from dpend.orbits.samples import SpecialPoint
 from dpend.orbits.special import special_points
 from dpend.orbits.walk import STRAYED
@@ -35,10 +29,6 @@ from dpend.status import Status, message
 _AT_FOLD = 1e-5
 # Below this angle [rad] rounding is what is left of an amplitude.
 _TINIEST = 1e-10
-# Each interval is looked at in this many pieces for passages through an angle.
-_PIECES = 8
-# Halvings of a piece, down to the last place of a share.
-_HALVINGS = 50
 
 
 @jax.tree_util.register_dataclass
@@ -59,8 +49,9 @@ class Family:
             no step was short enough, `MAX_ITERATIONS` if it has more points than were allowed.
         ends: what its beginning and its end are: `normal mode` (of an equilibrium), `homoclinic`
             (the period grows without bound as the energy tends to that of an equilibrium with a rod
-            upright), `closed` (it comes back to its beginning), `branch point`, `longest period`
-            (if one was given), `lost` or `unfinished` (see status).
+            upright), `closed` (it comes back to its beginning), `branch point`, `fast rotation`
+            (the energy grows without bound), `longest period` (if one was given), `lost` or
+            `unfinished` (see status).
     """
 
     orbits: PeriodicOrbit
@@ -70,6 +61,7 @@ class Family:
     status: Scalar
     ends: tuple[str, str] = field(metadata={"static": True})
     _curve: "Curve" = field(repr=False, metadata={"static": True})
+    _rows: Solved = field(repr=False, metadata={"static": True})
     _problem: "FamilyProblem" = field(repr=False)
 
     @property
@@ -82,93 +74,140 @@ class Family:
         """The sentence that says what its status means."""
         return message(self.status)
 
-    def at(self, theta1: Scalar, *, crossing: int | Any = 1) -> PeriodicOrbit:
-        """The orbits of this family released at `theta1`: Newton's method from where its curve
-        passes.
+    def at(
+        self,
+        theta1: Scalar | None = None,
+        *,
+        energy: Scalar | None = None,
+        period: Scalar | None = None,
+        crossing: int | Any = 1,
+    ) -> PeriodicOrbit:
+        """The orbits of this family released at `theta1`, or with this energy or period: Newton's
+        method from where its curve passes. Give one of the three.
 
         An orbit released at (-theta1, -theta2) counts; where the curve has it, the mirror image is
-        returned. Derivatives with respect to `theta1`, and to the pendulum that `follow_family` was
-        given, are those of the root (implicit function theorem): one linear solve and no walk.
-        Second ones are forward derivatives of these, as `jax.hessian` takes them. The walk needs
-        numbers, so that `jax.grad`, `jax.jacfwd` and their like work, and `jax.jit` around it does
-        not.
+        returned. Derivatives with respect to what is given, and to the pendulum that
+        `follow_family` was given, are those of the root (implicit function theorem): one linear
+        solve and no walk. Second ones are forward derivatives of these, as `jax.hessian` takes
+        them. The walk needs numbers, so that `jax.grad`, `jax.jacfwd` and their like work, and
+        `jax.jit` around it does not.
 
         Arguments:
-            theta1: release angles of the upper rod [rad], any shape.
-            crossing: which of the curve's passages through `theta1`, in order of arclength.
+            theta1: release angles of the upper rod [rad], any shape; not of `passing` orbits, which
+                all start at 0 or 180 degrees.
+            energy: [J], any shape; zero for both bobs at rest at the pivot's height.
+            period: minimal periods [s], any shape.
+            crossing: which of the curve's passages through the value, in order of arclength.
         Returns:
-            PeriodicOrbit with leaves of theta1's shape. Where the family does not get there, the
+            PeriodicOrbit with leaves of the value's shape. Where the family does not get there, the
             status is `NO_SUCH_ORBIT` and the rest NaN.
         Raises:
-            ValueError: theta1 not finite, below 1e-10 or traced by `jit`; a derivative asked for at
-                a fold in theta1, where it is infinite: `slopes` has those with respect to
-                arclength.
+            ValueError: none or several of theta1, energy and period; one that is not finite or
+                traced by `jit`; theta1 below 1e-10, a period not positive; a derivative asked for
+                where the family turns back in what is given, and it is infinite: `slopes` has those
+                with respect to arclength.
         """
-        return _at(self, theta1, crossing)
+        given = {"theta1": theta1, "energy": energy, "period": period}
+        at_most_one(**given)
+        name = next((name for name, value in given.items() if value is not None), "theta1")
+        return _at(self, name, given[name], crossing)
 
 
-def _at(family: Family, theta1: Scalar, crossing: int | Any) -> PeriodicOrbit:
+def _at(family: Family, name: str, value: Scalar | None, crossing: int | Any) -> PeriodicOrbit:
     """See `Family.at`."""
     crossing = integer("crossing", crossing)
-    theta1, wanted = _known_angles(theta1)
+    value, wanted = _known_values(name, value)
+    problem, flat = family._problem, wanted.ravel()
+    found = _points_at(family, name, flat, crossing)
+    held = None
+    leaves = jax.tree.leaves((value, problem.pendulum))
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        _refuse_folds(family, name, found, flat)
+        targets = LEVELS[name].natural(jnp.ravel(value), problem) * found.side
+        held = Held(name, targets, found.rows)
+    orbits = orbits_of(problem, found.solved, held)
+    astray = found.strayed & (orbits.status == Status.CONVERGED)
+    status = np.where(astray, Status.LEFT_BRANCH, orbits.status)
+    status = np.where(found.there, status, Status.NO_SUCH_ORBIT)
+    orbits = replace(mirrored(orbits, found.side), status=status)
+    return _shape(orbits, found.there, wanted.shape)
+
+
+class _Found(NamedTuple):
+    """Points where a curve passes values: whether it does, whether the root is another's, the sign
+    of the mirror image that was asked for, and the covectors of theta1 in it.
+    """
+
+    solved: Solved
+    there: np.ndarray
+    strayed: np.ndarray
+    side: np.ndarray
+    rows: np.ndarray
+
+
+def _points_at(family: Family, name: str, values: np.ndarray, crossing: int) -> _Found:
     problem, curve = family._problem, family._curve
-    targets = np.abs(wanted.ravel())
-    index, share = _passages(curve, targets, crossing)
-    found, start = index >= 0, np.maximum(index, 0)
+    if name == "theta1" and problem.symmetry == "passing":
+        raise ValueError(
+            "theta1 must not be given for passing orbits, got one: they all start at 0 or 180 "
+            "degrees; give energy or period"
+        )
+    if name == "theta1":
+        targets = np.abs(values)
+        index, share = angle_passages(curve, targets, crossing)
+    else:
+        known = replace(problem, pendulum=jax.tree.map(known_value, problem.pendulum))
+        targets = np.asarray(LEVELS[name].natural(values, known))
+        index, share = level_passages(problem, name, family._rows, curve, targets, crossing)
+    start = np.maximum(index, 0)
     points = curve.between(start, share)
-    side = np.where((points[:, 0] < 0) != (wanted.ravel() < 0), -1.0, 1.0)  # of the mirror image
-    points[:, 0] = np.where(points[:, 0] < 0, -targets, targets)
-    rows = np.zeros_like(points)
-    rows[:, 0] = 1.0
-    solved = problem.correct(points, rows, curve.steps[start + 1])
-    traced = any(
-        isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((theta1, problem.pendulum))
-    )
-    if traced:
-        _refuse_folds(family, solved, found, wanted.ravel())
-    along = jnp.ravel(theta1) * side if traced else None
-    orbits = orbits_of(problem, solved, along, rows)
+    side, rows = np.ones(len(values)), np.zeros_like(points)
+    if name == "theta1":
+        side = np.where((points[:, 0] < 0) != (values < 0), -1.0, 1.0)
+        points[:, 0] = np.where(points[:, 0] < 0, -targets, targets)
+        rows[:, 0] = 1.0
+        solved = problem.correct(points, rows, curve.steps[start + 1])
+    else:
+        rows = METRIC * curve.tangents_between(start, share)
+        near = problem.correct(points, rows, curve.steps[start + 1])
+        solved, _ = onto_level(problem, name, targets, near, curve.lengths[start])
     away = np.sqrt(np.sum(METRIC * (solved.point - points) ** 2, axis=1))
     strayed = away > np.maximum(STRAYED * curve.lengths[start], 1e-9)
-    status = np.where(
-        strayed & (orbits.status == Status.CONVERGED), Status.LEFT_BRANCH, orbits.status
-    )
-    status = np.where(found, status, Status.NO_SUCH_ORBIT)
-    return _shape(replace(mirrored(orbits, side), status=status), found, wanted.shape)
+    return _Found(solved, index >= 0, strayed, side, rows)
 
 
-def _known_angles(theta1: Scalar) -> tuple[jax.Array, np.ndarray]:
-    """The angles as they were given, which may carry derivatives, and as numbers."""
-    theta1 = (
-        real("theta1", theta1)
-        if isinstance(theta1, jax.Array)
-        else numbers("theta1", theta1, unit="rad")
-    )
-    theta1 = jnp.asarray(theta1, jnp.float64)
+def _known_values(name: str, value: Any) -> tuple[jax.Array, np.ndarray]:
+    """The values as they were given, which may carry derivatives, and as numbers."""
+    unit = LEVELS[name].unit
+    value = real(name, value) if isinstance(value, jax.Array) else numbers(name, value, unit=unit)
+    value = jnp.asarray(value, jnp.float64)
     try:
-        wanted = np.asarray(lax.stop_gradient(theta1))
+        wanted = np.asarray(lax.stop_gradient(value))
     except jax.errors.TracerArrayConversionError:
         raise ValueError(
-            "theta1 must be a number here, not traced by jit: use find_orbit inside jit"
+            f"{name} must be a number here, not traced by jit: use find_orbit inside jit"
         ) from None
-    if not wanted.size or not np.all(np.isfinite(wanted)) or np.any(np.abs(wanted) < _TINIEST):
+    least = {"theta1": f" and at least {_TINIEST:g} in size", "period": " and positive"}
+    good = np.isfinite(wanted)
+    if name != "energy":
+        good &= (np.abs(wanted) if name == "theta1" else wanted) >= _TINIEST
+    if not wanted.size or not np.all(good):
         raise ValueError(
-            f"theta1 must be finite and at least {_TINIEST:g} in size [rad], got {wanted}: give "
-            f"other angles"
+            f"{name} must be finite{least.get(name, '')} [{unit}], got {wanted}: give other values"
         )
-    return theta1, wanted
+    return value, wanted
 
 
-def _refuse_folds(family: Family, solved: Solved, found: np.ndarray, wanted: np.ndarray) -> None:
-    """Refuses a derivative with respect to theta1 where it is infinite."""
-    folds = np.array(
-        [abs(float(p.orbit.theta1)) for p in family.special_points if p.kind == "fold_theta1"]
-    )
-    near = np.any(np.abs(np.abs(wanted)[:, None] - folds) < _AT_FOLD**2, axis=1)
-    folded = near | (found & (np.abs(solved.tangent[:, 0]) < _AT_FOLD))
+def _refuse_folds(family: Family, name: str, found: _Found, wanted: np.ndarray) -> None:
+    """Refuses a derivative with respect to what is infinite at a fold."""
+    folded = found.there & (np.abs(LEVELS[name].slope(found.solved)) < _AT_FOLD)
+    if name == "theta1":
+        points = family.special_points
+        folds = np.array([abs(float(p.orbit.theta1)) for p in points if p.kind == "fold_theta1"])
+        folded |= np.any(np.abs(np.abs(wanted)[:, None] - folds) < _AT_FOLD**2, axis=1)
     if np.any(folded):
         raise ValueError(
-            f"theta1 must not be a fold of the family for a derivative, got "
+            f"{name} must not be a fold of the family for a derivative, got "
             f"{wanted[np.argmax(folded)]}: it is infinite there; the family's slopes are "
             f"derivatives with respect to arclength"
         )
@@ -185,27 +224,6 @@ def _shape(orbits: PeriodicOrbit, found: np.ndarray, shape: tuple[int, ...]) -> 
 
     wide = jax.tree.map(lambda leaf: jnp.reshape(leaf, shape), orbits.pendulum)
     return replace(jax.tree.map(leaf_of, orbits), pendulum=wide)
-
-
-def _passages(curve: Curve, targets: np.ndarray, crossing: int) -> tuple[np.ndarray, np.ndarray]:
-    """The interval (-1 where there is none) and the share of it at which |theta1| meets each
-    target.
-    """
-    pieces = np.arange(_PIECES) / _PIECES
-    index = np.repeat(np.arange(len(curve.points) - 1), _PIECES)
-    shares = np.tile(pieces, len(curve.points) - 1)
-    seen = np.append(np.abs(curve.between(index, shares)[:, 0]), np.abs(curve.points[-1, 0]))
-    below = seen[None, :] < targets[:, None]
-    passed = np.cumsum(below[:, 1:] != below[:, :-1], axis=1)
-    piece = np.argmax(passed >= crossing, axis=1)
-    found = passed[:, -1] >= crossing
-    low, high = shares[piece], shares[piece] + 1 / _PIECES
-    starts_below = below[np.arange(len(targets)), piece]
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        same = (np.abs(curve.between(index[piece], middle)[:, 0]) < targets) == starts_below
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return np.where(found, index[piece], -1), 0.5 * (low + high)
 
 
 def family_of(problem: FamilyProblem, rows: Solved, curve: Curve, ends: tuple[str, str]) -> Family:
@@ -225,5 +243,6 @@ def family_of(problem: FamilyProblem, rows: Solved, curve: Curve, ends: tuple[st
         status=jnp.asarray(int(status)),
         ends=ends,
         _curve=curve,
+        _rows=rows,
         _problem=problem,
     )

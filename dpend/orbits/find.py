@@ -36,17 +36,19 @@ from dpend.checks import (
     number,
     one_of,
     several,
+    shown,
     single,
 )
 from dpend.mechanics.pendulum import (
     Pendulum,
+    State,
     check_pendulum,
     hamiltonian,
     known_pendulum,
     released,
 )
 from dpend.mechanics.units import natural
-from dpend.orbits.arc import PARTS
+from dpend.orbits.arc import PARTS, RELEASED_SYMMETRIES
 from dpend.orbits.implicit import (
     ArcGiven,
     Known,
@@ -59,7 +61,6 @@ from dpend.orbits.implicit import (
 )
 from dpend.orbits.orbit import (
     BRANCHES,
-    RELEASED_SYMMETRIES,
     Outcome,
     PeriodicOrbit,
     mirrored,
@@ -82,6 +83,7 @@ from dpend.orbits.single import (
     steps_for,
 )
 from dpend.orbits.stability import stability_of
+from dpend.orbits.through import orbit_through, request_of
 from dpend.status import Status
 
 # How near to an equilibrium a search may end, in units of the swing.
@@ -175,10 +177,10 @@ def _near_guess(
 
 def _know_newton(pendulum: Pendulum, line: Line, newton: LineNewton, symmetry: str) -> Array:
     """The columns of `Known` where Newton's method ended, from its own last integration."""
-    start, end = released(*(line.base + newton.x * line.direction)), newton.shot.end
+    start = released(*(line.base + newton.x * line.direction))
     kappas = stability_of(newton.shot.matrix[None], symmetry, jnp)[1:]
-    at_end = [end.theta1, end.theta2, jnp.exp(newton.log_time), hamiltonian(pendulum, start)]
-    return jnp.stack([*jax.tree.leaves(start), *at_end, *kappas])
+    states = [*jax.tree.leaves(start), *jax.tree.leaves(newton.shot.end)]
+    return jnp.stack([*states, jnp.exp(newton.log_time), hamiltonian(pendulum, start), *kappas])
 
 
 def _swing(angles: Array) -> Scalar:
@@ -190,11 +192,15 @@ def _swing(angles: Array) -> Scalar:
 
 def find_orbit(
     pendulum: Pendulum | Any,
-    theta1: Scalar,
+    theta1: Scalar | None = None,
     *,
     branch: str | Any | None = None,
     guess: tuple[Scalar, Scalar] | Any | None = None,
+    state: State | Any | None = None,
+    period: Scalar | Any | None = None,
     symmetry: str | Any | None = None,
+    turns: tuple[int, int] | Any | None = None,
+    keep: str | Any = "energy",
     ratio: int | Any | None = None,
     crossing: int | Any = 1,
     turn: float | Any = FINE,
@@ -202,7 +208,8 @@ def find_orbit(
     max_iterations: int | Any = 40,
     error: bool | Any = True,
 ) -> PeriodicOrbit:
-    """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period.
+    """The periodic orbit released from rest at `theta1`: its partner angle theta2 and its period;
+    or the periodic orbit near the motion from any `state`.
 
     Solves theta(T/4) = 0 modulo pi (centred) or p(T/2) = 0 (brake) for (theta2, T) by damped Newton
     iterations whose Jacobian is forward-mode through the flow. Give one of:
@@ -217,6 +224,11 @@ def find_orbit(
     - `ratio` alone: of the orbits with theta2 = ratio theta1 on the in-phase (+1) or anti-phase
       (-1) branch, or on `branch`, the one nearest to `theta1`, which is then an unknown too; with
       `guess`, the one near it.
+    - `state` and `period`, without theta1: start from this motion over that time and take what
+      Newton's method finds, in segments (see `arc`), with the energy of the state (or with the
+      period, if that is kept), reduced to its minimal period. Without a symmetry the closed motion
+      x(T) = x(0) is solved for, unfolded by one parameter, and solved again with the symmetry that
+      it turns out to have. The arguments from `crossing` to `error` are of the other ways.
 
     Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
     and the pendulum are those of the root itself (implicit function theorem), second ones as
@@ -227,9 +239,15 @@ def find_orbit(
         theta1: release angle of the upper rod [rad].
         branch: `in-phase` (slow mode) or `anti-phase` (fast mode).
         guess: theta2 [rad], period [s].
+        state: a state on the orbit or near it, anywhere.
+        period: [s], with `state`.
         symmetry: with `guess`, `centred` or `brake`. Without it the guess is solved as brake and
             solved again as centred if the orbit is that; under tracing it stays brake, of which
-            every centred orbit is a case.
+            every centred orbit is a case. With `state` also `passing`, `odd` or `none`: see
+            `PeriodicOrbit`.
+        turns: with `state`, the full turns of both rods in a period, of an orbit that is passing or
+            has no symmetry; those of the motion if not given.
+        keep: with `state`, what the orbit has in common with its motion: `energy` or `period`.
         ratio: +1 or -1.
         crossing: which of the branch's passages through `theta1`, in order of arclength.
         turn: how far the fastest motion may advance in one integration step [rad]; 0.1 leaves
@@ -244,9 +262,10 @@ def find_orbit(
         residual; if the branch does not reach `theta1` (`NO_SUCH_ORBIT`), the orbit where it came
         closest to upright in theta1.
     Raises:
-        ValueError: theta1 not finite; none or more than one of branch and guess; theta1 a multiple
-            of pi with `branch`; both angles at an equilibrium; g not positive; an unknown branch,
-            symmetry or ratio; a period not positive.
+        ValueError: theta1 not finite; none or more than one of branch, guess and state; theta1 a
+            multiple of pi with `branch`; both angles at an equilibrium; g not positive; an unknown
+            branch, symmetry or ratio; a period not positive; a state without a period or traced by
+            `jit`; an argument of another way.
         RuntimeError: float64 is switched off in JAX.
     See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23
     (2009): families of
@@ -254,6 +273,12 @@ def find_orbit(
         period.
     """
     require_float64()
+    if state is not None or period is not None:
+        others = {"theta1": theta1, "branch": branch, "guess": guess, "ratio": ratio}
+        settings = crossing, turn, tolerance, max_iterations, error
+        others |= zip(_SETTINGS, settings, strict=True)
+        return _through_state(pendulum, state, period, (symmetry, turns, keep), others)
+    _leave_out("without state", {"turns": turns, "keep": keep}, {"keep": "energy"})
     theta1, crossing = number("theta1", theta1, unit="rad"), integer("crossing", crossing)
     _check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
     values = {
@@ -288,6 +313,27 @@ def find_orbit(
     if not _is_same(centred, orbit):
         return orbit
     return replace(centred, iterations=orbit.iterations + centred.iterations)
+
+
+# What `find_orbit` takes from a state not, with its defaults.
+_SETTINGS = {"crossing": 1, "turn": FINE, "tolerance": 1e-13, "max_iterations": 40, "error": True}
+
+
+def _through_state(
+    pendulum: Any, state: Any, period: Any, options: tuple[Any, Any, Any], others: dict[str, Any]
+) -> PeriodicOrbit:
+    """The orbit near a motion, once what is asked has been looked at."""
+    _leave_out("with state and period", others, _SETTINGS)
+    return orbit_through(pendulum, swinging_numbers(pendulum), request_of(state, period, *options))
+
+
+def _leave_out(when: str, given: dict[str, Any], defaults: dict[str, Any]) -> None:
+    """Refuses arguments that mean nothing here; None where there is no default."""
+    for name, value in given.items():
+        default = defaults.get(name)
+        plain = isinstance(value, (bool, int, float, str))
+        if value is not default and not (plain and value == default):
+            raise ValueError(f"{name} must not be given {when}, got {shown(value)}: leave it out")
 
 
 def _check_request(
@@ -380,6 +426,22 @@ def swinging_pendulum(pendulum: Any) -> Pendulum:
             f"g must be positive for orbits, got {fixed.g:g}: nothing swings back without gravity"
         )
     return fixed
+
+
+def swinging_numbers(pendulum: Any) -> Pendulum:
+    """The numbers behind a pendulum, also under eager differentiation, whose derivatives orbits
+    carry on.
+
+    Raises:
+        ValueError: no pendulum; a field that is an array or traced by `jit`; g not positive.
+    """
+    check_pendulum(pendulum)
+    numbers = {}
+    for name, leaf in vars(pendulum).items():
+        single(name, leaf)
+        known = known_value(leaf)
+        numbers[name] = leaf if known is None else known
+    return swinging_pendulum(Pendulum(**numbers))  # which refuses what `jit` traces
 
 
 def _multiple_of_pi(angle: float) -> bool:

@@ -22,16 +22,18 @@ from dpend.orbits.curve import (
     curve_of,
     cut_at_return,
     release_and_time,
+    release_columns,
     select,
     way_to,
 )
 from dpend.orbits.newton import METRIC, Solved, linearise, unpack_table
-from dpend.orbits.walk import CHUNK, NEARLY, Tasks, Walk, walk
+from dpend.orbits.stability import OPPOSITE
+from dpend.orbits.walk import CHUNK, FAST, NEARLY, Tasks, Walk, walk
 
 # Resonances k:n are told, and followed, up to this k.
 LARGEST_COVER = 6
 # Steps in a segment where none were counted yet.
-_MANY_STEPS = 40
+MANY_STEPS = 40
 # Singular values below this share of the largest are zero.
 _NO_RANK = 1e-3
 # How far along the new direction the branch is looked for, and how much further to its side it may
@@ -112,7 +114,7 @@ class FamilyProblem:
         if count > reach.points:
             return select(rows, slice(reach.points)), "unfinished"
         if end == "ended":
-            end = "homoclinic" if self._slows(rows) else "normal mode"
+            end = self._end(rows)
         return rows, end or "unfinished"
 
     def period(self, rows: Solved) -> np.ndarray:
@@ -143,8 +145,9 @@ class FamilyProblem:
         """The point of the family near one that is nearly on it, its tangent not known; None if
         there is none.
         """
-        row, steps = np.zeros(UNKNOWNS), np.array([_MANY_STEPS])
-        row[[0, 1, -2]] = 0.6, 0.4, 1.0  # crosses any curve but by accident
+        row, steps = np.zeros(UNKNOWNS), np.array([MANY_STEPS])
+        row[release_columns(self.symmetry)] = 0.6, 0.4  # crosses any curve but by accident
+        row[-2] = 1.0
         for _ in range(3):
             rows = self.correct(point[None], row[None], steps)
             if not rows.converged[0]:
@@ -152,9 +155,12 @@ class FamilyProblem:
             point, row, steps = rows.point[0], METRIC * rows.tangent[0], rows.steps
         return rows
 
-    def onto_branch(self, base: Solved, point: np.ndarray, sign: float) -> Solved | None:
-        """The first point of a branch that leaves the family of `base`, from that orbit's own point
-        on this problem; None if nothing is met.
+    def onto_branch(self, along: np.ndarray, point: np.ndarray, sign: float) -> Solved | None:
+        """The first point of a branch that leaves a family, from its own orbit's point on this
+        problem; None if nothing is met.
+
+        Arguments:
+            along: how the first state moves along the family.
         """
         for _ in range(
             3
@@ -162,7 +168,7 @@ class FamilyProblem:
             # here
         ):
             value, jacobian = (
-                np.asarray(x) for x in linearise(self.natural, point, _MANY_STEPS, self.arc)
+                np.asarray(x) for x in linearise(self.natural, point, MANY_STEPS, self.arc)
             )
             point = point - np.linalg.pinv(jacobian, rcond=_NO_RANK) @ value
         _, sizes, directions = np.linalg.svd(jacobian)
@@ -170,14 +176,14 @@ class FamilyProblem:
             return None
         kernel = directions[-2:] / np.sqrt(np.sum(METRIC * directions[-2:] ** 2, axis=1))[:, None]
         # The family's own direction is the one whose first node moves as the family's does.
-        own = np.linalg.lstsq(kernel[:, :4].T, base.tangent[0, :4], rcond=None)[0] @ kernel
+        own = np.linalg.lstsq(kernel[:, :4].T, along, rcond=None)[0] @ kernel
         own /= np.sqrt(own @ (METRIC * own))
         new = kernel[np.argmin(np.abs(kernel @ (METRIC * own)))]
         new = new - (new @ (METRIC * own)) * own
         new *= np.sign(new[np.argmax(np.abs(new))]) / np.sqrt(new @ (METRIC * new))
         new *= sign
         for size in _ONTO_BRANCH:
-            steps = np.array([_MANY_STEPS])
+            steps = np.array([MANY_STEPS])
             for _ in range(2):
                 rows = self.correct((point + size * new)[None], (METRIC * new)[None], steps)
                 steps = rows.steps
@@ -194,12 +200,19 @@ class FamilyProblem:
         upper, lower = float(1 + self.natural.m2), float(self.natural.m2 * self.natural.l2)
         return np.array([-upper - lower, lower - upper, upper - lower, upper + lower])
 
-    def _slows(self, rows: Solved) -> bool:
-        """Whether the time at the end grows like the logarithm of the distance from an
-        equilibrium's energy.
+    def level_near(self, energy: float) -> float:
+        """The energy of the equilibrium that is nearest in energy."""
+        return float(self.levels[np.argmin(np.abs(self.levels - energy))])
+
+    def _end(self, rows: Solved) -> str:
+        """What a family has ended at: an equilibrium's energy, where the time grows like the
+        logarithm of the distance from it, or an equilibrium, or rotation without end.
         """
+        if rows.energy[-1] > FAST * self.levels[3]:
+            return "fast rotation"
         gap = np.min(np.abs(rows.energy[-1] - self.levels))
-        return bool(abs(rows.time_slope[-1]) * gap > 1e-3 * abs(rows.energy_slope[-1]))
+        slows = abs(rows.time_slope[-1]) * gap > 1e-3 * abs(rows.energy_slope[-1])
+        return "homoclinic" if slows else "normal mode"
 
     def _near_limit(self, rows: Solved) -> bool:
         """Whether a family was lost where rounding, magnified by the inverse distance, keeps it
@@ -213,13 +226,13 @@ class FamilyProblem:
         its other rest.
         """
         curve = curve_of(rows)
-        own = release_and_time(origin)[0]
+        own = release_and_time(origin, self.symmetry)[0]
         other = (
-            origin.end[0, :2]
-            if self.symmetry == "brake"
-            else 2 * np.pi * np.asarray(self.turns) - own[:2]
+            2 * np.pi * np.asarray(self.turns) - own[:2]
+            if self.symmetry in OPPOSITE
+            else origin.end[0, release_columns(self.symmetry)]
         )
-        where = release_and_time(rows)
+        where = release_and_time(rows, self.symmetry)
         for i in range(max(since - 1, LEAVING), len(where) - 1):
             chord = where[i + 1] - where[i]
             for release in (own, np.append(other, own[2])):
@@ -238,8 +251,9 @@ class FamilyProblem:
             rows = self.correct(
                 curve.between(index, shares), METRIC * tangent, curve.steps[index + 1]
             )
-            apart = way_to(release_and_time(rows)[0], release)
-            slope = np.append(rows.tangent[0, :2], rows.time_slope[0] / rows.times[0].sum())
+            apart = way_to(release_and_time(rows, self.symmetry)[0], release)
+            first = rows.tangent[0, release_columns(self.symmetry)]
+            slope = np.append(first, rows.time_slope[0] / rows.times[0].sum())
             share += float(apart @ slope / (slope @ slope) / curve.lengths[i])
         return bool(np.linalg.norm(apart) < SAME_PLACE)
 
@@ -275,38 +289,3 @@ def guess_arc(
 # Room for the known states of six periods of a centred orbit, so that the laying of arcs compiles
 # once.
 _KNOWN = 4 * SEGMENTS * LARGEST_COVER
-
-
-def _unroll(problem: FamilyProblem, rows: Solved) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states known on half a period of an orbit: its nodes and, if it is centred, their
-    images about T/4.
-    """
-    states = rows.point[0, : 4 * SEGMENTS].reshape(SEGMENTS, 4)
-    times = np.concatenate([[0.0], np.cumsum(rows.times[0])])
-    if problem.symmetry != "centred":
-        return times[:-1], states
-    images = states[:0:-1] * [-1, -1, 1, 1] + 2 * np.pi * np.append(problem.turns, [0, 0])
-    centre = rows.end[0]
-    return np.append(times, 2 * times[-1] - times[-2:0:-1]), np.vstack([states, centre, images])
-
-
-def repeat_arc(problem: FamilyProblem, rows: Solved, halves: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states known on so many halves of an orbit's period."""
-    times, states = _unroll(problem, rows)
-    half = rows.times[0].sum() * PARTS[problem.symmetry] / 2
-    all_times, all_states = [times], [states]
-    for i in range(1, halves):
-        if problem.symmetry == "brake":
-            # Each rest reflects time: the second half is the first, backwards, with the momenta
-            # turned round.
-            back = (
-                np.append(half, times[:0:-1]),
-                np.vstack([rows.end[0], states[:0:-1]]) * [1, 1, -1, -1],
-            )
-            later = (half - back[0], back[1]) if i % 2 else (times, states)
-        else:
-            opposite = 2 * np.pi * np.append(problem.turns, [0, 0]) - states
-            later = (times, opposite if i % 2 else states)
-        all_times.append(i * half + later[0])
-        all_states.append(later[1])
-    return np.concatenate(all_times), np.concatenate(all_states)

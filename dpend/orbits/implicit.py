@@ -7,7 +7,7 @@ m2/m1 and the value of what is held fixed at the release, in natural units.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +20,7 @@ from dpend.motion.integrate import advance_state, step_size
 from dpend.orbits.arc import (
     LOG_DELTA,
     METHOD,
+    RELEASED_SYMMETRIES,
     SEGMENTS,
     UNFOLDING,
     arc_of,
@@ -27,6 +28,7 @@ from dpend.orbits.arc import (
     end_conditions,
     shooting_equations,
     stack_state,
+    state_halfway,
 )
 from dpend.orbits.newton import Solved
 from dpend.orbits.single import RK8
@@ -42,8 +44,10 @@ class Known(NamedTuple):
     theta2: Any
     p1: Any
     p2: Any
-    end1: Any  # the angles at the arc's end
+    end1: Any  # the angles at the arc's end, without symmetry at half of it
     end2: Any
+    end_p1: Any  # and the momenta
+    end_p2: Any
     time: Any  # of the arc
     energy: Any
     kappa: Any
@@ -109,15 +113,24 @@ def parameters_of(pendulum: Pendulum, target: Scalar) -> Array:
 
 
 class ArcGiven(NamedTuple):
-    """Of a root of segments: row . point is held at the target; steps of a segment; turns."""
+    """Of a root of segments: what row . point is, if that is held; steps of a segment; turns."""
 
     row: Float[Array, " D"]
     steps: Scalar
     turns: Float[Array, "2"]
 
 
+def _held_value(held: str, pendulum: Pendulum, point: Array, row: Array) -> Scalar:
+    """What is held at the target: row . point, the energy, or the log of the arc's time."""
+    if held == "energy":
+        return hamiltonian(pendulum, State(*point[:4]))
+    if held == "period":
+        return jnp.log(jnp.sum(arc_times(pendulum, point)[0]))
+    return row @ point
+
+
 def _linearise_arc(
-    symmetry: str, point: Array, parameters: Array, given: ArcGiven
+    held: str, symmetry: str, point: Array, parameters: Array, given: ArcGiven
 ) -> tuple[Array, Array]:
     arc, steps = arc_of(symmetry, given.turns), given.steps.astype(int)
     jacobian = shooting_equations(_pendulum(parameters), point, steps, arc).jacobian
@@ -129,10 +142,11 @@ def _linearise_arc(
             advance_state(METHOD, here, State(*nodes.T), step_size(time, steps), steps)
         ).T
         conditions, _ = end_conditions(here, nodes[0], end[-1], point[UNFOLDING], arc)
-        border = given.row @ point - parameters[2]
+        border = _held_value(held, here, point, given.row) - parameters[2]
         return jnp.concatenate([(end[:-1] - nodes[1:]).ravel(), conditions, border[None]])
 
-    return jnp.concatenate([jacobian, given.row[None]]), jax.jacfwd(closings)(parameters)
+    border = jax.grad(_held_value, 2)(held, _pendulum(parameters), point, given.row)
+    return jnp.concatenate([jacobian, border[None]]), jax.jacfwd(closings)(parameters)
 
 
 def _know_arc(symmetry: str, point: Array, parameters: Array, given: ArcGiven) -> Array:
@@ -142,24 +156,27 @@ def _know_arc(symmetry: str, point: Array, parameters: Array, given: ArcGiven) -
     end, matrices = transition(here, nodes, step_size(times, steps), steps, METHOD)
     stability = stability_of(jnp.moveaxis(matrices, -1, 0), symmetry, jnp)[1:]
     energy = hamiltonian(here, State(*point[:4]))
-    rest = [end.theta1[-1], end.theta2[-1], jnp.sum(times), energy, *stability]
-    return jnp.concatenate([point[:4], jnp.stack(rest)])
+    rest = jnp.stack([jnp.sum(times), energy, *stability])
+    last = stack_state(end)[:, -1] if symmetry != "none" else state_halfway(here, point)
+    return jnp.concatenate([point[:4], last, rest])
 
 
-def arc_equations(symmetry: str) -> Equations:
-    """The equations of an orbit in segments."""
-    return Equations(symmetry, _linearise_arc, _know_arc)
+@cache
+def arc_equations(symmetry: str, held: str = "theta1") -> Equations:
+    """The equations of an orbit in segments, `held` being `energy`, `period`, or a row . point."""
+    return Equations(symmetry, partial(_linearise_arc, held), _know_arc)
 
 
 def know_solved(rows: Solved, symmetry: str, xp: Any) -> Any:
-    """The columns of `Known` for points on a family, shape (..., 10), in NumPy or JAX.
+    """The columns of `Known` for points on a family, shape (..., 12), in NumPy or JAX.
 
-    But for `odd` orbits the start is at rest, exactly.
+    Orbits released from rest are at rest there exactly.
     """
     _, kappa, logarithm = stability_of(rows.matrices, symmetry, xp)
-    start = rows.point[..., :4] * xp.asarray([1.0, 1.0, *(2 * [float(symmetry == "odd")])])
+    moves = float(symmetry not in RELEASED_SYMMETRIES)
+    start = rows.point[..., :4] * xp.asarray([1.0, 1.0, moves, moves])
     rest = [rows.times.sum(axis=-1), rows.energy, kappa, logarithm]
-    return xp.concatenate([start, rows.end[..., :2], xp.stack(rest, axis=-1)], axis=-1)
+    return xp.concatenate([start, rows.end, xp.stack(rest, axis=-1)], axis=-1)
 
 
 class PieceGiven(NamedTuple):
@@ -195,8 +212,8 @@ def know_piece(symmetry: str, root: Array, parameters: Array, given: PieceGiven)
     start = released(*(parameters[2] * given.origin + root[0] * given.direction))
     end, matrix = transition(here, start, step_size(time, steps), steps, RK8)
     stability = stability_of(matrix[None], symmetry, jnp)[1:]
-    at_end = [end.theta1, end.theta2, time, hamiltonian(here, start), *stability]
-    return jnp.stack([*jax.tree.leaves(start), *at_end])
+    rest = [time, hamiltonian(here, start), *stability]
+    return jnp.stack([*jax.tree.leaves(start), *jax.tree.leaves(end), *rest])
 
 
 def piece_equations(symmetry: str) -> Equations:

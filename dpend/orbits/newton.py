@@ -15,10 +15,12 @@ from jax import lax
 from jaxtyping import Array
 
 from dpend.checks import Scalar
-from dpend.mechanics.pendulum import Pendulum, State, hamiltonian
+from dpend.mechanics.pendulum import Pendulum, State, hamiltonian, vector_field
 from dpend.orbits.arc import (
     LOG_DELTA,
     MOST_SEGMENT_STEPS,
+    NONE,
+    PASSING,
     SEGMENTS,
     TURN,
     UNKNOWNS,
@@ -28,6 +30,7 @@ from dpend.orbits.arc import (
     shooting_equations,
     solve,
     solve_transposed,
+    stack_state,
 )
 
 # Arclength: ds^2 is the mean over the nodes of dtheta1^2 + dtheta2^2, plus (d log Delta)^2.
@@ -82,10 +85,12 @@ class Solved(NamedTuple):
         miss, contraction: the first Newton update, and the second over the first.
         steps: how many a segment should have been given.
         converged: whether Newton's method did.
-        release_change: the change of the release on solving at half the step [rad].
+        release_change: the change of the release on solving at half the step [rad], of a passing
+            orbit that of the first rates.
         angle_error, time_error: of theta2 [rad] and of the time, relative, at this theta1 (or of
-            what else the aim asks): the change on solving at half the step, and what rounding on
-            the way makes of them.
+            what else the aim asks; without symmetry, at this energy; of a passing orbit the first
+            is of the direction phi, see `_of_moving`): the change on solving at half the step, and
+            what rounding on the way makes of them.
         iterations: of Newton's method.
         residual: of the equations, the largest.
         end: the state at the arc's end.
@@ -156,9 +161,8 @@ def _rounding(pendulum: Pendulum, point: Array, arc: Arc) -> Array:
     """
     sizes = jnp.max(jnp.abs(point[:LOG_DELTA].reshape(SEGMENTS, 4)), axis=0)
     none = jnp.zeros(2)
-    ends = jnp.stack([jnp.append(none, sizes[:2]), jnp.append(none, sizes[2:]), sizes])[
-        arc.symmetry
-    ]
+    angles, rest = jnp.append(none, sizes[:2]), jnp.append(none, sizes[2:])
+    ends = jnp.stack([angles, rest, sizes, angles, sizes])[arc.symmetry]
     unit = _ROUNDINGS * jnp.maximum(1.0, pendulum.m2 / pendulum.m1) ** 0.25
     return unit * jnp.concatenate([jnp.tile(sizes, SEGMENTS - 1), ends, none])
 
@@ -173,7 +177,11 @@ def _errors(
     carry to what is asked. Where `fixed` is off, the curve's slope tells what the others are off
     by; at a fold, where that is infinite, its curvature does.
     """
-    wanted = jnp.stack([jnp.asarray(aim.fixed), jnp.asarray(aim.asked), time])
+    energy, direction = _of_moving(pendulum, n.point)
+    passing = arc.symmetry == PASSING
+    fixed = jnp.where(passing | (arc.symmetry == NONE), energy, jnp.asarray(aim.fixed))
+    asked = jnp.where(passing, direction, jnp.asarray(aim.asked))
+    wanted = jnp.stack([fixed, asked, time])
     pulled = solve_transposed(n.factors, wanted.T).T * _rounding(pendulum, n.point, arc)
     off, moving = jnp.sqrt(jnp.sum(pulled[0] ** 2)), wanted[0] @ tangent
     slope = jnp.maximum(jnp.maximum(jnp.abs(moving), jnp.sqrt(off)), jnp.finfo(float).tiny)
@@ -182,12 +190,31 @@ def _errors(
     return jnp.abs(change) + jnp.sqrt(jnp.sum((pulled[1:] - along * pulled[:1]) ** 2, axis=1))
 
 
+def _of_moving(pendulum: Pendulum, point: Array) -> Array:
+    """The covectors of the energy, and of the direction at a start in {0, pi}^2, shape (2, D).
+
+    There the momenta of one energy are an ellipse, p = sqrt(2 K) L (cos phi, sin phi) with L L^T
+    the inertia and K the kinetic energy; d phi = (p1 dp2 - p2 dp1)/(2 K det L), and dH = theta' dp.
+    """
+    slope = stack_state(vector_field(pendulum, State(*point[:4])))
+    rates, (p1, p2) = slope[:2], point[2:4]
+    # det L = sqrt(m1 m2) l1 l2 where the rods are in line.
+    area = (p1 * rates[0] + p2 * rates[1]) * pendulum.l2 * jnp.sqrt(pendulum.m2)
+    direction = jnp.concatenate([jnp.zeros(2), jnp.stack([-p2, p1]) / area])
+    both = jnp.stack([jnp.concatenate([-slope[2:], rates]), direction])
+    return jnp.pad(both, ((0, 0), (0, UNKNOWNS - 4)))
+
+
+def _inertia(pendulum: Pendulum) -> Array:
+    """The momenta that belong to a rate of one."""
+    return jnp.stack([1 + pendulum.m2, pendulum.m2 * pendulum.l2**1.5])
+
+
 def _units(pendulum: Pendulum, amplitude: Scalar) -> Array:
     """What an update is measured in: the amplitude, and the momenta that belong to as large a
     rate.
     """
-    inertia = jnp.stack([1 + pendulum.m2, pendulum.m2 * pendulum.l2**1.5])
-    nodes = jnp.tile(jnp.concatenate([jnp.ones(2), inertia]), SEGMENTS)
+    nodes = jnp.tile(jnp.concatenate([jnp.ones(2), _inertia(pendulum)]), SEGMENTS)
     return jnp.append(amplitude * nodes, jnp.ones(2))
 
 
@@ -268,6 +295,7 @@ def _describe_root(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved
 
     level, slope = jax.jvp(energy, (n.point[:4],), (tangent[:4],))
     wanted = jnp.ceil(jnp.nan_to_num(jnp.max(s.turn) / TURN, nan=1.0))
+    rates = n.update[2:4] / _inertia(pendulum)
     return Solved(
         point=n.point,
         tangent=tangent,
@@ -276,7 +304,7 @@ def _describe_root(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved
         contraction=n.contraction,
         steps=jnp.clip(wanted, 1, MOST_SEGMENT_STEPS).astype(int),
         converged=n.done == 2,
-        release_change=jnp.max(jnp.abs(n.update[:2])),
+        release_change=jnp.max(jnp.abs(jnp.where(arc.symmetry == PASSING, rates, n.update[:2]))),
         angle_error=angle_error,
         time_error=time_error,
         iterations=n.iterations,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from dpend.checks import Scalar, known_value
 from dpend.mechanics.pendulum import Pendulum, State
 from dpend.mechanics.units import natural
-from dpend.orbits.arc import PARTS
+from dpend.orbits.arc import PARTS, state_halfway
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.implicit import (
     ArcGiven,
@@ -28,22 +28,24 @@ from dpend.orbits.implicit import (
 )
 from dpend.orbits.newton import Solved
 from dpend.orbits.single import FINE, Line, clock, rate_along, steps_for
-from dpend.orbits.stability import stability_class
+from dpend.orbits.stability import OPPOSITE, stability_class
 from dpend.status import Status
 
 _EPS = float(np.finfo(np.float64).eps)
 BRANCHES = ("in-phase", "anti-phase")
-RELEASED_SYMMETRIES = ("centred", "brake")
+# The families of the normal modes, and of the equilibria with one rod upright.
+FAMILIES = (*BRANCHES, "down-up", "up-down")
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PeriodicOrbit:
-    """A periodic orbit, released from rest unless it is `odd`, or many of one shape.
+    """A periodic orbit, or many of one shape.
 
     Attributes:
         pendulum: its pendulum.
-        state: at t = 0, at rest; of an odd orbit where theta1 is at an extreme.
+        state: at t = 0: at rest if centred or brake, where theta1 is at an extreme if odd, in {0,
+            pi}^2 if passing, where the potential energy is at an extreme if without symmetry.
         period: the minimal one [s].
         energy: H [J], zero for both bobs at rest at the pivot's height.
         residual: the largest of the equations solved. From a guess: angles at T/4 [rad] if centred,
@@ -53,15 +55,19 @@ class PeriodicOrbit:
             linear solve; on a branch those of the walk's last step and those at the wanted release.
         kappa: half the sum of the two non-trivial Floquet multipliers.
         log_abs_kappa: log |kappa|, natural.
-        dual: the state at T/2, the other rest of the orbit.
-        turns: theta(T/4)/pi of a centred orbit, two integers; zeros otherwise.
+        dual: the state at T/2, the other rest of the orbit if it has one.
+        turns: theta(T/4)/pi of a centred orbit, two integers; the full turns of both rods in a
+            period of one that is passing or without symmetry; zeros otherwise.
         error_estimate: of theta2 [rad] (of theta1 with `ratio`) and the period [s], theta1 taken as
             it is: the change on solving again at half the step, and what the rounding of the motion
-            makes of them; NaN if that was not asked for.
+            makes of them; NaN if that was not asked for. Without symmetry, and of a passing orbit,
+            the energy is taken as it is instead; of a passing orbit the first is of the direction
+            in which it starts, the angle phi of p = L (cos phi, sin phi) sqrt(2 K), L L^T being the
+            inertia and K the kinetic energy.
         status: a value of `Status`.
         symmetry: `centred` (theta(T/4) in {0, pi}^2 modulo 2 pi), `brake` (any other released from
-            rest), or `odd` (x(T/2) = -x(0) up to full turns, never at rest; found by
-            `follow_family`).
+            rest), `odd` (x(T/2) = -x(0) up to full turns, never at rest), `passing` (theta in {0,
+            pi}^2 at 0 and T/2, never at rest) or `none`.
     """
 
     pendulum: Pendulum
@@ -139,10 +145,16 @@ def orbit_in_units(
     second = xp.sqrt(pendulum.l1 / pendulum.g)
     momentum = pendulum.m1 * pendulum.l1**2 / second
     state = State(known.theta1, known.theta2, momentum * known.p1, momentum * known.p2)
-    end1, end2 = known.end1, known.end2
-    if symmetry != "brake":
-        end1, end2 = 2 * np.pi * turns[0] - state.theta1, 2 * np.pi * turns[1] - state.theta2
-    whole = turns if symmetry == "centred" else 0 * turns
+    dual = State(known.end1, known.end2, 0.0 - state.p1, 0.0 - state.p2)
+    if symmetry in OPPOSITE:
+        angles = 2 * np.pi * turns[0] - state.theta1, 2 * np.pi * turns[1] - state.theta2
+        dual = replace(dual, theta1=angles[0], theta2=angles[1])
+    elif symmetry != "brake":
+        dual = replace(dual, p1=momentum * known.end_p1, p2=momentum * known.end_p2)
+    whole = turns if symmetry in ("centred", "none") else 0 * turns
+    if symmetry == "passing":
+        centre = xp.nan_to_num(xp.round(xp.stack([state.theta1, state.theta2]) / np.pi))
+        whole = [turns[0] - centre[0], turns[1] - centre[1]]
     one = xp.ones_like(known.time)
     period = PARTS[symmetry] * second * known.time
     return PeriodicOrbit(
@@ -154,7 +166,7 @@ def orbit_in_units(
         iterations=outcome.iterations,
         kappa=known.kappa,
         log_abs_kappa=known.log_abs_kappa,
-        dual=State(end1, end2, 0.0 - state.p1, 0.0 - state.p2),
+        dual=dual,
         turns=((whole[0] * one).astype(int), (whole[1] * one).astype(int)),
         error_estimate=(outcome.angle_error, outcome.time_error * _constant(period)),
         status=outcome.status,
@@ -165,6 +177,9 @@ def orbit_in_units(
 def _constant(value: Any) -> Any:
     """The value without its derivatives."""
     return value if isinstance(value, np.ndarray) else lax.stop_gradient(value)
+
+
+_halfway = jax.jit(state_halfway)
 
 
 @jax.jit
@@ -210,35 +225,46 @@ class Slopes(NamedTuple):
     energy: Scalar
 
 
-@partial(jax.jit, static_argnames="symmetry")
+class Held(NamedTuple):
+    """What orbits were solved for, which everything else of them is a function of.
+
+    Attributes:
+        name: `theta1`, `energy` or `period`.
+        targets: its values in natural units (of the period the log of the arc's time), shape (n,).
+        rows: of theta1 the covectors, shape (n, D).
+    """
+
+    name: str
+    targets: Any
+    rows: Any
+
+
+@partial(jax.jit, static_argnames=("symmetry", "held"))
 def _carry(
-    pendulum: Pendulum, targets: Array, values: tuple, given: ArcGiven, symmetry: str
+    pendulum: Pendulum, targets: Array, values: tuple, given: ArcGiven, symmetry: str, held: str
 ) -> Array:
     """What is known, as a function of the pendulum and the targets."""
+    equations = arc_equations(symmetry, held)
 
     def one(values: tuple, parameters: Array, row: Array, steps: Array) -> Array:
         here = ArcGiven(row, steps, given.turns)
-        return jnp.asarray(implicit(arc_equations(symmetry), values, parameters, here)[1])
+        return jnp.asarray(implicit(equations, values, parameters, here)[1])
 
     return jax.vmap(one)(values, parameters_of(pendulum, targets), given.row, given.steps)
 
 
-def orbits_of(
-    problem: FamilyProblem, rows: Solved, targets: Any = None, along: Any = None
-) -> PeriodicOrbit:
-    """Points as orbits.
-
-    With `targets`, the values of theta1 at which the rows `along` were solved, everything carries
-    derivatives.
-    """
+def orbits_of(problem: FamilyProblem, rows: Solved, held: Held | None = None) -> PeriodicOrbit:
+    """Points as orbits; where it is told what was held, everything carries derivatives."""
     known, turns = know_solved(rows, problem.symmetry, np), np.asarray(problem.turns)
     status = np.where(rows.converged > 0, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
     outcome = outcome_of(rows, status, np)
-    if targets is None:
+    if problem.symmetry == "none":
+        known[:, 4:8] = [_halfway(problem.natural, point) for point in rows.point]
+    if held is None:
         pendulum = jax.tree.map(known_value, problem.pendulum)
         return orbit_in_units(pendulum, Known(*known.T), turns, problem.symmetry, outcome, np)
-    given = ArcGiven(along, rows.steps, jnp.asarray(turns))
-    known = _carry(problem.pendulum, targets, (rows.point, known), given, problem.symmetry)
+    given, values = ArcGiven(held.rows, rows.steps, jnp.asarray(turns)), (rows.point, known)
+    known = _carry(problem.pendulum, held.targets, values, given, problem.symmetry, held.name)
     return orbit_in_units(problem.pendulum, Known(*known.T), turns, problem.symmetry, outcome)
 
 

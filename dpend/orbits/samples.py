@@ -12,11 +12,12 @@ import jax
 import numpy as np
 
 from dpend.checks import Scalar
+from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.curve import Curve
 from dpend.orbits.follow import LARGEST_COVER, FamilyProblem
 from dpend.orbits.newton import METRIC, Solved
 from dpend.orbits.orbit import PeriodicOrbit, Slopes
-from dpend.orbits.stability import LARGEST_C, growth_of, stability_of
+from dpend.orbits.stability import LARGEST_C, OPPOSITE, growth_of, stability_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,35 +67,38 @@ class Test(NamedTuple):
 
 
 def test_functions(symmetry: str) -> list[Test]:
-    """What is looked for; the second argument of a test is c, of brake orbits kappa."""
-    tests = [
-        Test("fold_theta1", lambda rows, c: rows.tangent[:, 0], None),
-        Test("fold_energy", lambda rows, c: rows.energy_slope, None),
-    ]
+    """What is looked for; the second argument of a test is c, of other than `OPPOSITE` orbits
+    kappa.
+    """
+    tests = [Test("fold_energy", lambda rows, c: rows.energy_slope, None)]
+    if symmetry != "passing":  # these start at one theta1
+        tests.insert(0, Test("fold_theta1", lambda rows, c: rows.tangent[:, 0], None))
     branches = {
         "centred": (("odd", 1), ("brake", 1)),
         "brake": (None, ("brake", 2)),
         "odd": (None, None),
+        "passing": (None, ("passing", 2)),
+        "none": (None, None),
     }[symmetry]
+    squares = symmetry in OPPOSITE
+    again = symmetry not in ("odd", "none")  # what branches off at a resonance is followed
     tests.append(Test("above", lambda rows, c: c - 1, branches[0]))
     tests.append(Test("below", lambda rows, c: c + 1, branches[1]))
     for k in range(2, LARGEST_COVER + 1):
         for n in range(1, k):
-            if math.gcd(n, k) > 1 or (symmetry == "brake" and 2 * n > k):
+            if math.gcd(n, k) > 1 or (not squares and 2 * n > k):
                 continue
-            target = math.cos((2 if symmetry == "brake" else 1) * math.pi * n / k)
-            branch = "centred" if symmetry == "centred" and n % 2 == 0 else "brake"
+            target = math.cos((1 if squares else 2) * math.pi * n / k)
+            branch = "brake" if symmetry == "centred" and n % 2 == 1 else symmetry
             value = partial(lambda target, rows, c: c - target, target)
-            tests.append(
-                Test(f"resonance_{k}:{n}", value, (branch, k) if symmetry != "odd" else None)
-            )
+            tests.append(Test(f"resonance_{k}:{n}", value, (branch, k) if again else None))
     return tests
 
 
 def measure_of(rows: Solved, symmetry: str) -> np.ndarray:
-    """What the tests are told: c, or kappa of brake orbits."""
+    """What the tests are told: c, or kappa of other than `OPPOSITE` orbits."""
     c, kappa, _ = stability_of(rows.matrices, symmetry)
-    return np.asarray(kappa if symmetry == "brake" else c)
+    return np.asarray(c if symmetry in OPPOSITE else kappa)
 
 
 # What rounding leaves of c and of slopes, as bounds. About 306 places of 60 families, c scattered
@@ -104,7 +108,7 @@ _ROUNDING, _LEVERAGE, _WOBBLE = 2000 * np.finfo(float).eps, 4.0, 50.0
 
 
 def measure_error(rows: Solved, symmetry: str) -> np.ndarray:
-    """What c, of brake orbits kappa, is known to."""
+    """What c, or kappa, is known to."""
     spread = np.maximum(rows.release_change, rows.time_error)
     return np.asarray(
         growth_of(rows.matrices, symmetry) * np.maximum(_ROUNDING, _LEVERAGE * spread)
@@ -116,7 +120,7 @@ def kappa_error(spot: "Spot", symmetry: str) -> float:
     it.
     """
     error = float(measure_error(spot.row, symmetry)[0] + abs(spot.steepness) * spot.error)
-    if symmetry == "brake":
+    if symmetry not in OPPOSITE:
         return error
     error = min(error, LARGEST_C)
     c = min(abs(float(measure_of(spot.row, symmetry)[0])), LARGEST_C)
@@ -139,10 +143,13 @@ def _steepness(problem: FamilyProblem, rows: Solved) -> np.ndarray:
     """The size of the energy's gradient at the release, which multiplies the tangent's error; a
     bound if it moves.
     """
+    if problem.symmetry in RELEASED_SYMMETRIES:
+        weights = np.array([1 + problem.natural.m2, problem.natural.m2 * problem.natural.l2])
+        return np.asarray(np.linalg.norm(weights * np.sin(rows.point[:, :2]), axis=1))
     if problem.symmetry == "odd":
         return np.full(len(rows.point), problem.levels[3])
-    weights = np.array([1 + problem.natural.m2, problem.natural.m2 * problem.natural.l2])
-    return np.asarray(np.linalg.norm(weights * np.sin(rows.point[:, :2]), axis=1))
+    # Twice the kinetic energy, at most that above the lowest level.
+    return np.asarray(2 * np.maximum(rows.energy - problem.levels[0], problem.levels[3]))
 
 
 class Samples(NamedTuple):

@@ -2,13 +2,12 @@
 off.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from dpend.orbits.crossings import Zone, crossings, merge_samples, outside, overlaps
 from dpend.orbits.curve import Curve, select
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.newton import Solved
@@ -27,6 +26,7 @@ from dpend.orbits.samples import (
     values_of_tests,
 )
 from dpend.orbits.walk import CROSSING
+from dpend.orbits.zones import Zone, find_zones, merge_samples, outside, overlaps
 
 
 def special_points(
@@ -37,7 +37,7 @@ def special_points(
     """
     track = Track(problem, curve, arclength)
     samples = Samples(arclength[len(arclength) - len(rows.point) :], rows)
-    zones = crossings(track, samples)
+    zones = find_zones(track, samples)
     samples = outside(zones, _with_extrema(track, outside(zones, samples, with_ends=True)))
     changes = _changes(problem, samples)
     places = [
@@ -59,26 +59,25 @@ def _with_extrema(track: Track, samples: Samples) -> Samples:
     """
     symmetry = track.problem.symmetry
     measure = measure_of(samples.rows, symmetry)
-    ranged = [
-        test
-        for test in test_functions(symmetry)
-        if test.kind.startswith(("above", "below", "resonance"))
-    ]
+    tests = test_functions(symmetry)
+    ranged = [test for test in tests if test.kind.startswith(("above", "below", "resonance"))]
     levels = np.arcsinh([-float(test.value(samples.rows, 0 * measure)[0]) for test in ranged])
     triples = []
-    for function, targets in (
+    heights: list[tuple[Callable[[Solved], np.ndarray], np.ndarray]] = [
         (lambda rows: np.arcsinh(measure_of(rows, symmetry)), levels),
-        (lambda rows: rows.tangent[:, 0], np.zeros(1)),
         (lambda rows: rows.energy_slope, np.zeros(1)),
-    ):
+    ]
+    if any(test.kind == "fold_theta1" for test in tests):
+        heights.insert(1, (lambda rows: rows.tangent[:, 0], np.zeros(1)))
+    for function, targets in heights:
         h = function(samples.rows)
         before, here, after = h[:-2], h[1:-1], h[2:]
         highest, lowest = (here >= before) & (here >= after), (here <= before) & (here <= after)
         sense = np.where(highest, 1.0, np.where(lowest, -1.0, 0.0))
-        (near,) = np.nonzero(
-            (sense != 0)
-            & (_in_reach(h, sense, targets) | _in_reach(np.sinh(h), sense, np.sinh(targets)))
-        )
+        with np.errstate(over="ignore"):  # the energy of fast rotation is steep
+            wide = np.sinh(h)
+        reach = _in_reach(h, sense, targets) | _in_reach(wide, sense, np.sinh(targets))
+        (near,) = np.nonzero((sense != 0) & reach)
         triples += [
             (function, samples.where[i : i + 3].copy(), h[i : i + 3] * sense[i], sense[i])
             for i in near

@@ -8,7 +8,8 @@ block, which splits like the square root of the error.
 Time reversal R (theta, p) -> (theta, -p) and reflection (theta, p) -> (-theta, -p) do the rest:
 
 - brake orbit, at rest at 0 and T/2: monodromy R Phi^-1 R Phi with Phi = Phi(T/2), hence
-  kappa = 1 + 2 tr(B^T C);
+  kappa = 1 + 2 tr(B^T C); of a passing orbit, theta in {0, pi}^2 at 0 and T/2, with N = -R in the
+  place of R, which is the same;
 - x(T/2) = -x(0): monodromy Phi(T/2)^2; with c = (tr(-Phi(T/2)) - 2)/2, kappa = 2 c^2 - 1 >= -1, so
   that such orbits never double their period (Frauenfelder and Moreno, arXiv:2301.01803);
 - centred (also theta(T/4) in {0, pi}^2): Phi(T/2) = N Q^-1 N Q with Q = Phi(T/4) = [[a, b], [c',
@@ -29,6 +30,9 @@ from dpend.mechanics.pendulum import Pendulum, State, check_motion
 from dpend.methods.runge_kutta import Point
 from dpend.methods.scheme import Scheme, check_scheme
 from dpend.motion.integrate import march, step_size
+
+# Orbits with x(T/2) = -x(0) up to full turns: their monodromy is a square, and c tells more.
+OPPOSITE = ("centred", "odd")
 
 
 def transition(
@@ -71,22 +75,23 @@ def monodromy(
 
 
 def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, Any]:
-    """c (NaN for brake orbits), kappa and log |kappa| from Phi over the shooting time, given as a
-    product.
+    """c (NaN but for `OPPOSITE` orbits), kappa and log |kappa| from Phi over the shooting time,
+    given as a product.
 
     With Phi = [[A, B], [C, D]] the product: kappa = 1 + 2 tr(B^T C) of brake orbits; of the others
     kappa = 2 c^2 - 1, with c = (tr(-Phi) - 2)/2 of odd ones and c = 1 - 2 tr(A^T D) of centred
     ones. The product is scaled as it grows: no kappa is too large for its logarithm.
 
     Arguments:
-        matrices: of the consecutive segments of a quarter (centred) or half (brake, odd) of the
-            period, shape (..., S, 4, 4).
-        symmetry: `centred`, `brake` or `odd`.
+        matrices: of the consecutive segments of a quarter (centred), half (brake, odd, passing) or
+            the whole (none) of the period, shape (..., S, 4, 4).
+        symmetry: of `SYMMETRIES`.
         xp: numpy, or jax.numpy under differentiation.
     """
     product, scale = _product(matrices, xp)
-    if symmetry == "odd":
-        offset, trace = -1.0, -0.5 * product.trace(axis1=-2, axis2=-1)
+    if symmetry in ("odd", "none"):
+        sign = -0.5 if symmetry == "odd" else 0.5
+        offset, trace = -1.0, sign * product.trace(axis1=-2, axis2=-1)
     elif symmetry == "centred":
         offset, trace, scale = (
             1.0,
@@ -102,7 +107,7 @@ def stability_of(matrices: Any, symmetry: str, xp: Any = np) -> tuple[Any, Any, 
     value = offset + trace * xp.exp(xp.minimum(scale, _LARGEST_EXPONENT))
     beyond = scale > _MANY_DIGITS
     logarithm = xp.where(beyond, scale, 0.0) + _log_abs(xp.where(beyond, trace, value), xp)
-    if symmetry == "brake":
+    if symmetry not in OPPOSITE:
         return xp.full_like(value, xp.nan), value, logarithm
     kappa = 2 * xp.where(abs(value) < LARGEST_C, value, LARGEST_C) ** 2 - 1
     inner = logarithm > _MANY_DIGITS
@@ -127,19 +132,18 @@ def _product(matrices: Any, xp: Any) -> tuple[Any, Any]:
 
 
 def growth_of(matrices: np.ndarray, symmetry: str) -> np.ndarray:
-    """What rounding is multiplied by in the c, or kappa of brake orbits, that `stability_of` makes
-    of Phi.
+    """What rounding is multiplied by in the c, or kappa of other than `OPPOSITE` orbits, that
+    `stability_of` makes of Phi.
 
-    Both are sums of products of entries of Phi, of `odd` orbits of entries, that may cancel. The
-    blocks are measured so that the unit of momentum does not count.
+    Both are sums of products of entries of Phi, of `odd` and `none` orbits of entries, that may
+    cancel. The blocks are measured so that the unit of momentum does not count.
     """
     product, scale = _product(matrices, np)
     blocks = product[..., :2, :2], product[..., 2:, 2:], product[..., :2, 2:], product[..., 2:, :2]
     a, d, b, c = (abs(block).max(axis=(-2, -1)) for block in blocks)
     logarithm = scale + np.log(np.maximum(np.maximum(a, d), np.sqrt(b * c)))
-    return np.asarray(
-        np.exp(np.minimum((1 if symmetry == "odd" else 2) * logarithm, _LARGEST_EXPONENT))
-    )
+    factors = 1 if symmetry in ("odd", "none") else 2
+    return np.asarray(np.exp(np.minimum(factors * logarithm, _LARGEST_EXPONENT)))
 
 
 def _log_abs(value: Any, xp: Any) -> Any:

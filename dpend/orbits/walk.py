@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from dpend.checks import Scalar
-from dpend.mechanics.linear import equilibria, normal_modes
+from dpend.mechanics.linear import equilibria, fast_frequency, normal_modes
 from dpend.mechanics.pendulum import Pendulum, momenta
 from dpend.orbits.arc import LOG_DELTA, SEGMENTS, Arc
 from dpend.orbits.newton import METRIC, ROW, Aim, Solved, correct
@@ -81,21 +82,42 @@ def start_at_mode(pendulum: Pendulum, slow: Scalar) -> Walk:
     """
     modes = normal_modes(pendulum)
     mode = jax.tree.map(lambda a, b: jnp.where(slow, a, b), *modes)
+    return _start_swinging(pendulum, np.zeros(2), mode.frequency, (1.0, mode.ratio))
+
+
+def start_at_saddle(pendulum: Pendulum, upper: Scalar) -> Walk:
+    """The same about the equilibrium with the upper or the lower rod upright, whose linear motion
+    swings in one direction and escapes in the other: theta1 is between 0 and pi at first.
+    """
+    exponents = equilibria(pendulum).exponents
+    frequencies = jnp.max(jnp.imag(exponents), axis=1)
+    down_up, up_down = frequencies[1], frequencies[2]
+    # theta2/theta1, positive and without cancellation in both.
+    ratio = down_up**2 / (1 + down_up**2 * pendulum.l2)
+    inverse = pendulum.m2 * up_down**2 * pendulum.l2 / ((1 + pendulum.m2) * (1 + up_down**2))
+    direction = jnp.where(upper, -inverse, 1.0), jnp.where(upper, -1.0, ratio)
+    centre = jnp.pi * jnp.where(upper, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    return _start_swinging(pendulum, centre, jnp.where(upper, up_down, down_up), direction)
+
+
+def _start_swinging(
+    pendulum: Pendulum, centre: Any, frequency: Scalar, direction: tuple[Any, Any]
+) -> Walk:
+    """A walk at an equilibrium, about to follow theta = centre + direction cos(frequency t)."""
     phase = 0.5 * jnp.pi / SEGMENTS * jnp.arange(SEGMENTS, dtype=jnp.float64)
-    moving = momenta(
-        pendulum, 0.0, 0.0, mode.frequency, mode.frequency * mode.ratio
-    )  # at the bottom
+    moving = momenta(pendulum, *centre, *(frequency * x for x in direction))  # at the bottom
     shape = [
-        jnp.cos(phase),
-        mode.ratio * jnp.cos(phase),
+        direction[0] * jnp.cos(phase),
+        direction[1] * jnp.cos(phase),
         -moving.p1 * jnp.sin(phase),
         -moving.p2 * jnp.sin(phase),
     ]
     tangent = jnp.append(jnp.stack(shape, axis=1).ravel(), jnp.zeros(2))
     tangent = tangent / jnp.sqrt(tangent @ (METRIC * tangent))
     # There the fastest rate is that of the fast mode.
-    delta = 0.5 * jnp.pi / mode.frequency * modes[1].frequency / SEGMENTS
-    point = jnp.append(jnp.zeros(LOG_DELTA), jnp.stack([jnp.log(delta), 0.0]))
+    delta = 0.5 * jnp.pi / frequency * fast_frequency(pendulum) / SEGMENTS
+    nodes = jnp.tile(jnp.concatenate([centre, jnp.zeros(2)]), SEGMENTS)
+    point = jnp.append(nodes, jnp.stack([jnp.log(delta), 0.0]))
     nothing = jnp.zeros(())
     first, steps = jnp.asarray(FIRST_STEP), jnp.asarray(4)
     return Walk(
@@ -118,6 +140,8 @@ class Tasks(NamedTuple):
 # the weights' torques, the energy's slope in arclength as small), or where it has shrunk to this
 # amplitude [rad] about an equilibrium.
 HOMOCLINIC, _SMALLEST = 1e-8, 0.01
+# ... or where gravity is this small a part of its energy, and the rods turn over freely.
+FAST = 100.0
 # Orbits that pass an equilibrium on their way are known no better than rounding over the distance
 # from its energy: where that has come to the second number [rad], the family has ended at the
 # first.
@@ -241,6 +265,6 @@ def _accept(
     homoclinic = jnp.any(jnp.abs(gaps[1:]) < close) & (
         jnp.abs(new.energy_slope) < 1e3 * close * unit
     )
-    ended = homoclinic | (shrinking & (size < _SMALLEST))
+    ended = homoclinic | (shrinking & (size < _SMALLEST)) | (new.energy > FAST * unit)
     status = jnp.where(taken & ended, 1, jnp.where(w.step < _SHORTEST_STEP, 2, 0))
     return jax.tree.map(partial(jnp.where, taken), after, before), taken, status

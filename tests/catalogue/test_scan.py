@@ -9,7 +9,8 @@ from elsewhere import FORTY
 
 import dpend
 from dpend.catalogue.bicubic import Cells as _Cells
-from dpend.catalogue.scan import Budget, scan_release
+from dpend.catalogue.rows import Releases
+from dpend.catalogue.scan import Budget, scan_circle
 from dpend.mechanics.units import natural
 
 
@@ -17,10 +18,9 @@ def scan(pendulum, theta1_deg, max_period, intervals=128):
     """Returns to rest, times in seconds."""
     second = float(np.sqrt(pendulum.l1 / pendulum.g))
     scaled = jax.tree.map(float, natural(pendulum))
-    result = scan_release(
-        scaled, float(np.radians(theta1_deg)), 0.5 * max_period / second, intervals, Budget(10**9)
-    )
-    return result, np.array([(zero.theta2, zero.time * second) for zero in result.zeros]).reshape(
+    circle = Releases(scaled, float(np.radians(theta1_deg)))
+    result = scan_circle(circle, 0.5 * max_period / second, intervals, Budget(10**9))
+    return result, np.array([(zero.angle, zero.time * second) for zero in result.zeros]).reshape(
         -1, 2
     )
 

@@ -13,6 +13,7 @@ from elsewhere import monodromy
 
 import dpend
 from dpend import Pendulum, Status
+from dpend.orbits.arc import arc_times
 from dpend.orbits.stability import growth_of, stability_of
 
 # m = l = g = 1: where c - 1 and c change sign, theta1, theta2, T (None where only theta1 is known).
@@ -580,11 +581,12 @@ def test_families_up_to_a_period(unit):
 def test_what_branches_off_at_c_of_minus_one():
     """With Phi(T/2) = [[A, B], [C, D]]: where C vanishes on a release, brake orbits that are not
     centred, at rest after half a period by diffrax; where B vanishes the displacement is of the
-    momenta alone, and there is no rest.
+    momenta alone, and there is no rest: orbits pass the bottom twice a period, by diffrax too, and
+    their family leads from one of these places to the other.
     """
     pendulum = Pendulum(1.0, 3.0, 1.0, 0.3, 1.0)
     family = dpend.follow_family(pendulum, "in-phase")
-    kinds = []
+    kinds, passing = [], []
     for point in family.special_points:
         half = monodromy(point.orbit, 0.5) if point.kind.startswith("stability") else np.eye(4)
         if abs(np.trace(half)) > 1e-3:
@@ -592,8 +594,7 @@ def test_what_branches_off_at_c_of_minus_one():
         at_rest = bool(np.max(np.abs(half[:2, 2:])) > 1e-3)
         kinds.append(at_rest)
         if not at_rest:
-            with pytest.raises(ValueError, match="whose orbits are never at rest"):
-                dpend.follow_family(pendulum, point)
+            passing.append(dpend.follow_family(pendulum, point))
             continue
         branch = dpend.follow_family(pendulum, point, most_points=20)
         assert branch.symmetry == "brake"
@@ -603,6 +604,18 @@ def test_what_branches_off_at_c_of_minus_one():
         np.testing.assert_allclose(states[2:, 29], 0, atol=1e-9)
         assert np.max(np.abs(np.sin(states[:2, 14]))) > 1e-3  # not centred
     assert sorted(kinds) == [False, False, True, True]
+    one, other = passing
+    assert {family.ends for family in passing} == {("branch point", "branch point")}
+    np.testing.assert_allclose(one.orbits.period[0], other.orbits.period[-1], rtol=1e-3)
+    np.testing.assert_allclose(other.orbits.period[0], one.orbits.period[-1], rtol=1e-3)
+    for i in (0, 9, 18):
+        orbit = single(one.orbits, i)
+        states = motion(orbit)
+        np.testing.assert_allclose(states[:2, 29], 0, atol=1e-9)
+        np.testing.assert_allclose(states[:, 59], jax.tree.leaves(orbit.state), atol=1e-9)
+        matrix = monodromy(orbit, 1.0)
+        np.testing.assert_allclose(orbit.kappa, (np.trace(matrix) - 2) / 2, rtol=1e-9)
+        assert np.max(np.abs(states[2:, 29] + states[2:, 59])) > 1e-3  # not centred
 
 
 @pytest.mark.slow
@@ -671,3 +684,54 @@ def test_second_derivatives_on_a_family(paper):
     first, nudge = jax.grad(lambda theta1: family.at(theta1).period), 1e-4
     numeric = (first(0.7 + nudge) - first(0.7 - nudge)) / (2 * nudge)
     np.testing.assert_allclose(bend, numeric, rtol=1e-6)
+
+
+# What the linear motion about a saddle is, and the folds in theta1, m = l = g = 1.
+@pytest.mark.parametrize(("branch", "centre", "folds"), [
+    ("down-up", (0.0, np.pi), []),
+    ("up-down", (np.pi, 0.0), [2.877713, 3.19445]),
+])  # fmt: skip
+def test_families_of_the_saddles(unit, branch, centre, folds):
+    """From 2 pi/2^(1/4) to the upright pendulum; diffrax sees the orbit pass the saddle's place a
+    quarter of its period after the release.
+    """
+    family = dpend.follow_family(unit, branch)
+    assert (family.ends, int(family.status)) == (("normal mode", "homoclinic"), Status.CONVERGED)
+    mode = jnp.asarray(family._curve.points[0])
+    np.testing.assert_allclose(4 * arc_times(unit, mode)[0].sum(), 2 * np.pi / 2**0.25, rtol=1e-14)
+    np.testing.assert_allclose(mode[:2], centre)
+    found = [float(p.orbit.theta1) for p in family.special_points if p.kind == "fold_theta1"]
+    np.testing.assert_allclose(found, folds, atol=5e-6)
+    np.testing.assert_allclose(family.orbits.energy[-1], 3.0, atol=1e-7)
+    states = motion(single(family.orbits, 12))
+    np.testing.assert_allclose(states[:2, 14], centre, atol=1e-9)
+
+
+def test_orbits_of_an_energy_or_a_period(families):
+    """The same orbits as by the release angle; derivatives are those of neighbours on the curve."""
+    family, angles = families["anti-phase"], np.array([0.3, 1.5, 2.7])
+    orbits = family.at(angles)
+    for name in ("energy", "period"):
+        again = family.at(**{name: getattr(orbits, name)})
+        np.testing.assert_array_equal(again.status, Status.CONVERGED)
+        np.testing.assert_allclose(again.theta1, angles, rtol=1e-11)
+        np.testing.assert_allclose(getattr(again, name), getattr(orbits, name), rtol=1e-14)
+    assert family.at(energy=3.1).status == family.at(period=3.0).status == Status.NO_SUCH_ORBIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "value"), [("energy", -1.5), ("period", 6.0)])
+def test_derivatives_of_orbits_of_an_energy_or_a_period(name, value):
+    """By central differences, whose own errors are some 1e-8 and 1e-6 here."""
+    other = "period" if name == "energy" else "energy"
+
+    def found(value, mass):
+        family = dpend.follow_family(Pendulum(1.0, 1.0, 1.0, mass, 1.0), "anti-phase")
+        return getattr(family.at(**{name: value}), other)
+
+    slopes, h = jax.grad(found, (0, 1))(value, 1.0), 1e-4
+    by_value = (found(value + h, 1.0) - found(value - h, 1.0)) / (2 * h)
+    by_mass = (found(value, 1.0 + h) - found(value, 1.0 - h)) / (2 * h)
+    np.testing.assert_allclose(slopes, [by_value, by_mass], rtol=1e-6)
+    second = (found(value + h, 1.0) - 2 * found(value, 1.0) + found(value - h, 1.0)) / h**2
+    np.testing.assert_allclose(jax.hessian(found)(value, 1.0), second, rtol=1e-4)

@@ -58,7 +58,7 @@ _APART = 1e-6
 _BESIDE = (0.0, 1e-5, -1e-5, 5e-5, -5e-5)
 
 
-def crossings(track: Track, samples: Samples) -> list[Zone]:
+def find_zones(track: Track, samples: Samples) -> list[Zone]:
     """The stretches of a curve where the determinant changes sign, found by bisection; those that
     overlap are one.
     """
