@@ -1,8 +1,8 @@
 """The description and the links that a package index shows: the README, with its relative links
 made those of the repository at the released version.
 
-The repository is named when a release is built: `DPEND_REPOSITORY=https://host/owner/dpend`. Without
-it the README stays as it is.
+The repository is named when a release is built: `DPEND_REPOSITORY=https://host/owner/dpend`.
+Without it the README stays as it is.
 """
 
 import os
