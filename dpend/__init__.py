@@ -20,7 +20,7 @@ from dpend.catalogue.release import find_brake_orbits as find_brake_orbits
 from dpend.catalogue.survey import find_brake_families as find_brake_families
 from dpend.inverse.design import Design as Design
 from dpend.inverse.design import design_pendulum as design_pendulum
-from dpend.inverse.fit import Fit as Fit
+from dpend.inverse.estimates import Fit as Fit
 from dpend.inverse.fit import fit_parameters as fit_parameters
 from dpend.inverse.measurements import load_angles as load_angles
 from dpend.maps.periodic import periodic_points as periodic_points

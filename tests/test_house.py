@@ -32,7 +32,7 @@ catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files 
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
-inverse.fit inverse.problem inverse.nearest inverse.design
+inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
 map_picture section_picture plots animate tables report writing reading terminal options
 orbit_commands simulation_commands section_commands cli

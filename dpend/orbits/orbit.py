@@ -1,5 +1,6 @@
 """`PeriodicOrbit`, and how one is made from a root: units, outcome, derivatives."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -29,6 +30,7 @@ from dpend.orbits.implicit import (
 from dpend.orbits.newton import Solved
 from dpend.orbits.single import FINE, Line, clock, rate_along, steps_for
 from dpend.orbits.stability import OPPOSITE, stability_class
+from dpend.records import Quantities, frame, outcome, quantities, span, variables
 from dpend.status import Status
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -95,9 +97,72 @@ class PeriodicOrbit:
         return self.state.theta2
 
     @property
-    def stability(self) -> str:
-        """`elliptic`, `hyperbolic` or `inverse hyperbolic`, of a single orbit."""
-        return stability_class(float(self.kappa))
+    def stability(self) -> Any:
+        """`elliptic`, `hyperbolic` or `inverse hyperbolic`; of many orbits an array of these."""
+        if not np.ndim(self.kappa):
+            return stability_class(float(self.kappa))
+        kappas = np.asarray(self.kappa)
+        return np.array([stability_class(one) for one in kappas.ravel()]).reshape(kappas.shape)
+
+    def __len__(self) -> int:
+        """How many orbits there are along the first axis."""
+        if not np.ndim(self.period):
+            raise TypeError("a single orbit has no length")
+        return int(np.shape(self.period)[0])
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __getitem__(self, index: Any) -> "PeriodicOrbit":
+        """Some of many orbits, as NumPy's indices choose them; `orbits[3]` is a single one."""
+        shape = np.shape(self.period)
+        if not shape:
+            raise TypeError("a single orbit cannot be indexed")
+
+        def choose(leaf: Any) -> Any:
+            return (jnp if isinstance(leaf, jax.Array) else np).broadcast_to(leaf, shape)[index]
+
+        return jax.tree.map(choose, self)
+
+    def __iter__(self) -> Iterator["PeriodicOrbit"]:
+        return (self[i] for i in range(len(self)))
+
+    def to_dataframe(self) -> Any:
+        """A row for each orbit, with the names and the units of files: angles in degrees."""
+        return frame(orbit_quantities(self))
+
+    def to_xarray(self) -> Any:
+        """The orbits as an `xarray.Dataset` over `orbit`: radians and SI units, the angles in
+        degrees as coordinates.
+        """
+        import xarray
+
+        data, degrees = variables(orbit_quantities(self), "orbit")
+        return xarray.Dataset(data, degrees)
+
+    def __repr__(self) -> str:
+        many = f"{'x'.join(map(str, np.shape(self.period)))} " if np.ndim(self.period) else ""
+        angles = (span(name, getattr(self, name), "rad") for name in ("theta1", "theta2"))
+        told = ", ".join((*angles, span("period", self.period, "s"), span("kappa", self.kappa)))
+        return f"<PeriodicOrbit: {many}{self.symmetry}, {told}, {outcome(self.status)}>"
+
+
+def orbit_quantities(orbits: PeriodicOrbit) -> Quantities:
+    """All that is known of orbits, of each one a row: what a table of them has as columns."""
+    shape, rows = np.shape(orbits.period), int(np.size(orbits.period))
+    flat = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), shape).ravel(), orbits)
+    names = "period energy kappa log_abs_kappa residual iterations status stability"
+    dual = {f"dual_{name}": column for name, column in quantities(flat.dual).items()}
+    parts = {
+        "theta2_error": (flat.error_estimate[0], "rad"),
+        "period_error": (flat.error_estimate[1], "s"),
+        "turns1": (flat.turns[0], ""),
+        "turns2": (flat.turns[1], ""),
+        "symmetry": (np.full(rows, orbits.symmetry), ""),
+    }
+    return (
+        quantities(flat.state) | quantities(flat, names) | parts | dual | quantities(flat.pendulum)
+    )
 
 
 def mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
