@@ -63,6 +63,8 @@ from dpend.motion.simulate import simulate as simulate
 from dpend.motion.trajectory import Trajectory as Trajectory
 from dpend.orbits.continuation import follow_family as follow_family
 from dpend.orbits.family import Family as Family
+from dpend.orbits.files import load_orbits as load_orbits
+from dpend.orbits.files import save_orbits as save_orbits
 from dpend.orbits.find import find_orbit as find_orbit
 from dpend.orbits.orbit import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits.samples import SpecialPoint as SpecialPoint

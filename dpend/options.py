@@ -104,7 +104,7 @@ app = typer.Typer(
 )
 
 
-def _tell_version(asked: bool) -> None:
+def _tell_version(asked: bool | None) -> None:
     if asked:
         typer.echo(f"dpend {__version__}")
         raise typer.Exit
@@ -114,7 +114,7 @@ _VERSION = typer.Option("--version", callback=_tell_version, is_eager=True, help
 
 
 @app.callback()
-def _commands(version: Annotated[bool, _VERSION] = False) -> None:
+def _commands(version: Annotated[bool | None, _VERSION] = None) -> None:
     """Keeps `dpend orbit` a subcommand."""
 
 

@@ -34,6 +34,7 @@ from dpend.options import (
     numeric,
     radians,
 )
+from dpend.orbits.files import orbit_record, orbits_record
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, FAMILIES, PeriodicOrbit
 from dpend.places import check_place, replacing
@@ -42,7 +43,6 @@ from dpend.report import (
     converged,
     design_record,
     family_record,
-    orbit_record,
     print_atlas,
     print_design,
     print_family,
@@ -116,7 +116,7 @@ def orbit(
     records = [
         orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()
     ]
-    record = {"orbits": records} if both else records[0]
+    record = orbits_record(records, both)
     _write(record, out, formats)
     return record, partial(print_orbits, pendulum, records, out), converged(*found.values())
 

@@ -27,7 +27,8 @@ maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.
 maps.section maps.returns maps.periodic
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.zones orbits.special
-orbits.passages orbits.through orbits.find orbits.family orbits.branching orbits.continuation
+orbits.passages orbits.files orbits.through orbits.find orbits.family orbits.branching
+orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey

@@ -2,6 +2,7 @@
 they are made of.
 """
 
+import json
 from pathlib import Path
 
 import jax
@@ -158,3 +159,43 @@ def test_reprs_pass_where_numbers_do_not(orbits):
 
 def test_columns_of_orbits_have_one_length(family):
     assert {len(of) for of, _ in orbit_quantities(family.orbits).values()} == {54}
+
+
+def test_saved_orbits_come_back(orbits, tmp_path):
+    """To the last bit but for angles, which a degree may cost it; what was not found stays so."""
+    path = tmp_path / "F.json"
+    dpend.save_orbits(orbits, path)
+    back = dpend.load_orbits(path)
+    assert (back.symmetry, len(back)) == ("centred", 3)
+    ours, theirs = orbit_quantities(back), orbit_quantities(orbits)
+    for name, (value, unit) in theirs.items():
+        if value.dtype.kind == "f":
+            rtol = 3e-16 if unit == "rad" else 0
+            np.testing.assert_allclose(ours[name][0], value, rtol=rtol, err_msg=name)
+        else:
+            assert ours[name][0].tolist() == value.tolist()
+    dpend.save_orbits(orbits[0], path)
+    single = dpend.load_orbits(path)
+    assert np.shape(single.period) == ()
+    assert single.period == float(orbits.period[0])
+    follows = dpend.reference(single.pendulum, single.state, [single.period])
+    assert abs(follows.state.theta2[0] - single.theta2) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"format": 2}, "its format is 2, this version reads 1"),
+        ({"period_s": "1"}, "period_s must be"),
+        ({"dual": None}, "dual must be an object"),
+        ({"status": "fine"}, "status must be one of"),
+        ({"turns": [0.5, 0]}, "turns must be integers"),
+        ({"orbits": []}, "orbits must be a list"),
+    ],
+)
+def test_what_is_no_file_of_orbits_is_refused(orbits, tmp_path, change, text):
+    path = tmp_path / "F.json"
+    dpend.save_orbits(orbits[0], path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(ValueError, match=f"path must be a file that save_orbits .*{text}"):
+        dpend.load_orbits(path)
