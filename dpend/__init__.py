@@ -23,9 +23,11 @@ from dpend.inverse.design import design_pendulum as design_pendulum
 from dpend.inverse.estimates import Fit as Fit
 from dpend.inverse.fit import fit_parameters as fit_parameters
 from dpend.inverse.measurements import load_angles as load_angles
+from dpend.machine import configure as configure
 from dpend.maps.periodic import periodic_points as periodic_points
 from dpend.maps.returns import Return as Return
 from dpend.maps.returns import return_map as return_map
+from dpend.maps.rotation import rotation_numbers as rotation_numbers
 from dpend.maps.section import section as section
 from dpend.maps.store import StoreWarning as StoreWarning
 from dpend.maps.sweep import sweep as sweep

@@ -1,9 +1,9 @@
-"""How JAX is set up when dpend is imported: float64, one CPU device a core, and XLA options that
-make time loops fast.
+"""How JAX is set up: float64 and XLA options that make time loops fast when dpend is imported, and
+one CPU device a core when it first computes.
 
-This is the package's one effect at import, and it happens only while JAX has not started a backend.
-With `DPEND_PLAIN_JAX=1` in the environment nothing is touched: everything works, more slowly, and
-float64 is then the caller's to switch on.
+All of it happens only while JAX has not started a backend: a program that has used JAX before keeps
+its devices. `dpend.configure` chooses them. With `DPEND_PLAIN_JAX=1` in the environment nothing is
+touched: everything works, more slowly, and float64 is then the caller's to switch on.
 
 The options are undocumented, and XLA ends the process over a flag it does not know, so each name is
 looked up in the installed jaxlib first. What they are worth was measured: one order-8 trajectory
@@ -12,6 +12,7 @@ first, which takes 0.2 s where there are any.
 """
 
 import contextlib
+import functools
 import itertools
 import mmap
 import os
@@ -203,39 +204,62 @@ def _add_compile_options() -> None:
         os.environ["XLA_FLAGS"] = before
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _is_plain() -> bool:
+    return os.environ.get(PLAIN, "") not in ("", "0")
 
 
-def configure() -> None:
+def _set_up() -> None:
     """Sets JAX up for this package, unless it runs already or `DPEND_PLAIN_JAX=1` asks to leave it
     alone.
 
     Raises:
         RuntimeError: `XLA_FLAGS` that XLA would end the process over.
     """
-    if os.environ.get(PLAIN, "") not in ("", "0"):
+    if _is_plain() or is_running():
         return
-    devices = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
-    forced = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    wanted = _cores() if devices < 0 and not forced else devices
-    try:
-        jax.config.update(
-            "jax_num_cpu_devices", wanted
-        )  # refused once a backend runs: the public test for that
-    except RuntimeError:
-        return
-    if (
-        "JAX_ENABLE_X64" not in os.environ
-    ):  # the user's own word stands; `require_float64` then says what is missing
+    # The user's own word stands; `require_float64` then says what is missing.
+    if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     _check_flags()
     with contextlib.suppress(OSError):
         _add_compile_options()
 
 
+def is_running() -> bool:
+    """Whether JAX has started a backend."""
+    chosen = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
+    if not choose_devices(2 if chosen == 1 else 1):
+        return True
+    choose_devices(chosen)
+    return False
+
+
+def choose_devices(count: int) -> bool:
+    """Whether JAX could be given so many CPU devices: it refuses once a backend runs, which is its
+    public test for that.
+    """
+    try:
+        jax.config.update("jax_num_cpu_devices", count)
+    except RuntimeError:
+        return False
+    return True
+
+
+def count_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def take_all_cores() -> None:
+    """Gives JAX one CPU device a core, once, unless it runs or somebody has chosen their number."""
+    chosen = jax.config.jax_num_cpu_devices >= 0  # type: ignore[attr-defined]
+    forced = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not (_is_plain() or chosen or forced):
+        choose_devices(count_cores())
+
+
 def require_float64() -> None:
-    """Refuses to compute in single precision.
+    """Refuses to compute in single precision; at the first computation, takes all cores.
 
     Raises:
         RuntimeError: `jax_enable_x64` is off.
@@ -246,6 +270,7 @@ def require_float64() -> None:
             "anything, "
             'or call jax.config.update("jax_enable_x64", True), or set JAX_ENABLE_X64=1'
         )
+    take_all_cores()
 
 
-configure()
+_set_up()

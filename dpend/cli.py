@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 from dpend import orbit_commands, section_commands, simulation_commands
-from dpend._runtime import catch_interrupts, leave_quietly
+from dpend._runtime import catch_interrupts, leave_quietly, take_all_cores
 from dpend.options import app
 from dpend.terminal import tell_error
 
@@ -78,6 +78,7 @@ def _run(arguments: list[str]) -> int:
         # to be left plain.
         if "JAX_ENABLE_X64" not in os.environ:
             jax.config.update("jax_enable_x64", True)
+        take_all_cores()
         _keep_compiled_code()
         with np.errstate(
             all="ignore"

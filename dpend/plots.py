@@ -15,7 +15,6 @@ from dpend.checks import instance, integer, one_of, shown, single
 from dpend.inverse.estimates import Fit
 from dpend.map_picture import LABELS, draw_map
 from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
-from dpend.motion.simulate import simulate
 from dpend.motion.trajectory import Trajectory
 from dpend.orbits.family import Family
 from dpend.orbits.orbit import PeriodicOrbit
@@ -159,16 +158,9 @@ def orbit_sheet(orbits: dict[str, PeriodicOrbit] | Any) -> "Figure":
     steps = 20 * (_STROBES - 1)  # over half a period, so that the strobes fall on both rests
     for (name, orbit), row in zip(orbits.items(), grid, strict=True):
         period = float(orbit.period)
-        whole = simulate(
-            orbit.pendulum, orbit.state, period, step=period / (2 * steps), error=False
-        )
-        half = Trajectory(
-            whole.time[: steps + 1],
-            jax.tree.map(lambda leaf: leaf[: steps + 1], whole.state),
-            whole.energy_drift, whole.error_estimate, whole.steps, whole.status, whole.scheme,
-            method=whole.method,
-        )  # fmt: skip
-        strobe(orbit.pendulum, half, row[0], every=20)
+        times = np.linspace(0.0, period, 2 * steps + 1)
+        whole = orbit.trajectory(times)
+        strobe(orbit.pendulum, orbit.trajectory(times[: steps + 1]), row[0], every=20)
         path(whole, row[1])
         angles(whole, row[2])
         row[0].set_title(f"{name}, {period / (2 * (_STROBES - 1)):.3f} s apart", fontsize="medium")
@@ -276,8 +268,8 @@ def section(dataset: Any, ax: "Axes | Any | None" = None, *, periodic: Any | Non
 
     Arguments:
         dataset: what `section` returned.
-        periodic: what `periodic_points` returned on the same plane: rings where |kappa| <= 1,
-            crosses where the orbit is unstable.
+        periodic: what `periodic_points` returned on the same plane, or a list of such: rings where
+            |kappa| <= 1, crosses where the orbit is unstable.
     Raises:
         ValueError: other datasets.
     """
@@ -285,14 +277,16 @@ def section(dataset: Any, ax: "Axes | Any | None" = None, *, periodic: Any | Non
 
     instance("dataset", dataset, xarray.Dataset, "what dpend.section returns")
     _check_variables("dataset", dataset, ("angle", "momentum", "side"), "dpend.section")
-    if periodic is not None:
-        instance("periodic", periodic, xarray.Dataset, "what dpend.periodic_points returns")
+    several = periodic if isinstance(periodic, (list, tuple)) else [periodic]
+    marked = [] if periodic is None else several
+    for one in marked:
+        instance("periodic", one, xarray.Dataset, "what dpend.periodic_points returns")
         names = ("angle", "momentum", "kappa")
-        _check_variables("periodic", periodic, names, "dpend.periodic_points")
+        _check_variables("periodic", one, names, "dpend.periodic_points")
     ax = _axes(ax)
     draw_section(ax, dataset)
-    if periodic is not None:
-        draw_periodic(ax, periodic)
+    for one in marked:
+        draw_periodic(ax, one)
     return ax
 
 

@@ -9,7 +9,6 @@ import dpend
 from dpend.motion.trajectory import Trajectory
 from dpend.places import check_place, replacing
 from dpend.records import columns, json_text
-from dpend.section_picture import draw_periodic
 
 
 def writer(path: Path) -> Callable[[Trajectory], None]:
@@ -77,9 +76,7 @@ def draw_section(found: Any, orbits: list[Any], path: Path) -> None:
         from dpend import plots
 
         fig, ax = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
-        plots.section(found, ax)
-        for rows in orbits:
-            draw_periodic(ax, rows)
+        plots.section(found, ax, periodic=orbits)
         return fig
 
     _save_figure(picture, path, dpi=200)

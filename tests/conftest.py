@@ -18,6 +18,7 @@ import jax
 import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+dpend.configure()
 
 
 @pytest.fixture(scope="session")

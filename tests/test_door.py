@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 
 import dpend
 import dpend.animate
@@ -274,6 +275,7 @@ SAVED = dpend.Trajectory(TIMES, State(ANGLES, ANGLES, 0 * TIMES, 0 * TIMES), 0.0
 ORBIT = dpend.PeriodicOrbit(
     PAPER, RELEASE, 1.0, -1.0, 0.0, 3, 0.5, -0.7, RELEASE, (0, 0), (0.0, 0.0), 0, "brake"
 )
+SECTION = xarray.Dataset()  # nobody computes one for this
 FAMILY = object.__new__(dpend.Family)  # nobody follows one for this
 for field in ("_problem", "_curve"):
     object.__setattr__(FAMILY, field, None)
@@ -372,6 +374,16 @@ DOORS = {
         {"pendulum": PAPER, "state": RELEASE},
         {"pendulum": PENDULUM, "state": STATE},
         "dpend.mechanics.pendulum.sincos",
+    ),
+    "configure": Door(
+        dpend.configure,
+        {},
+        {
+            "devices": kind(COUNT[0], [jax.local_device_count()], none=True),
+            "async_dispatch": kind(NO_FLAGS, none=True),
+            "x64": kind(NO_FLAGS, [True, np.True_]),
+        },
+        "dpend.machine.is_running",
     ),
     "normal_modes": Door(
         dpend.normal_modes,
@@ -577,6 +589,14 @@ DOORS = {
             "progress": PROGRESS,
         },
         "dpend.maps.periodic.launches",
+    ),
+    "rotation_numbers": Door(
+        dpend.rotation_numbers,
+        {"dataset": SECTION, "centre": (0.0, 0.0)},
+        {
+            "dataset": kind([None, *NO_OBJECTS, SAVED]),
+            "centre": kind([None, *NO_OBJECTS, (0.1, math.nan), (1.0, 2.0, 3.0), (0.1, "1")]),
+        },
     ),
     "monodromy": Door(
         dpend.monodromy,

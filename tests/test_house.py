@@ -16,7 +16,7 @@ import dpend
 # in its own wing.
 # The public names, `dpend` itself, come last but for the doors, which draw, print and serve.
 ORDER = """
-_version _runtime checks places status records
+_version _runtime checks machine places status records
 mechanics.trig mechanics.pendulum mechanics.surface mechanics.linear mechanics.units
 methods.runge_kutta methods.circle methods.gauss methods.nodes methods.collocation methods.scheme
 motion.integrate motion.estimate motion.trajectory motion.adaptive motion.variation motion.saved
@@ -24,11 +24,11 @@ motion.stepped motion.tables motion.simulate motion.reference motion.root motion
 motion.crossings motion.gradients
 chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
-maps.section maps.returns maps.periodic
+maps.section maps.returns maps.periodic maps.rotation
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
-orbits.search orbits.curve orbits.follow orbits.orbit orbits.samples orbits.zones orbits.special
-orbits.passages orbits.files orbits.through orbits.find orbits.family orbits.branching
-orbits.continuation
+orbits.search orbits.curve orbits.follow orbits.path orbits.orbit orbits.derivatives orbits.samples
+orbits.zones orbits.special orbits.passages orbits.files orbits.through orbits.find orbits.family
+orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey

@@ -7,9 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+import dpend
 from dpend import _runtime
 
 
@@ -43,8 +45,38 @@ print(json.dumps([x64, devices, os.environ.get("XLA_FLAGS"), error]))
 """
 
 
-def test_import_sets_up_float64_and_a_device_a_core():
-    assert run(REPORT) == [True, _runtime._cores(), None, None]
+def test_import_sets_up_float64_and_no_more():
+    assert run(REPORT) == [True, 1, None, None]
+
+
+DEVICES = """
+import json, jax, numpy as np
+import dpend
+{before}
+motion = dpend.simulate(dpend.Pendulum(), dpend.released(1.0, 0.4), times=[1.0])
+print(json.dumps([jax.local_device_count(), float(motion.state.theta1[0])]))
+"""
+
+
+def test_computing_takes_all_cores_unless_told_otherwise():
+    """And the numbers do not change with them."""
+    cores, first = run(DEVICES.format(before=""))
+    three, second = run(DEVICES.format(before="dpend.configure(devices=3, async_dispatch=False)"))
+    running = "jax.numpy.zeros(1).block_until_ready()"
+    one, third = run(DEVICES.format(before=running))
+    assert (cores, three, one) == (_runtime.count_cores(), 3, 1)
+    assert first == second == third
+
+
+def test_what_comes_too_late_is_refused():
+    """Here JAX runs long since."""
+    count = jax.local_device_count()
+    jax.numpy.zeros(1).block_until_ready()
+    dpend.configure(devices=count)
+    with pytest.raises(RuntimeError, match="devices must be chosen before JAX computes anything"):
+        dpend.configure(devices=count + 1)
+    with pytest.raises(RuntimeError, match="async_dispatch must be chosen before JAX"):
+        dpend.configure(devices=count, async_dispatch=False)
 
 
 @pytest.mark.slow

@@ -88,7 +88,8 @@ def find_orbits(
         most_steps: time steps of all motions, as of `find_brake_orbits`.
     Raises:
         ValueError: an energy at which nothing moves; max_period not positive, or so long that the
-            fast normal mode would swing 32 times, or that most_steps are not enough; another
+            fast normal mode would swing 32 times (of motions faster than all releases accordingly
+            shorter), or that most_steps are not enough; another
             symmetry; g not positive; a traced argument; lengths, masses or g whose products leave
             the range of float64.
         RuntimeError: float64 is switched off in JAX.
@@ -101,6 +102,7 @@ def find_orbits(
     max_period = check_period(fixed, max_period)
     scaled, half, second = in_natural_units(fixed, max_period)
     circles = _circles(scaled, energy, fixed)
+    check_period(fixed, max_period, circles[0].faster)
     expected = sum(steps_of(foresee(circle, half)) for circle in circles)
     budget = make_budget(most_steps, expected, max_period)
     scans: list[Scan] = []
@@ -113,20 +115,24 @@ def find_orbits(
         result, refined, moved = settle(scan, budget)
         scans.append(result)
         unsettled, refinements = unsettled + moved, max(refinements, refined)
-    search = _Search(fixed, second, max_period, budget)
-    orbits, lost = search.solve(circles, scans)
-    parted = sum(abs(one.winding - one.degree) for one in scans)
-    coverage = Coverage(
+    orbits, lost = _Search(fixed, second, max_period, budget).solve(circles, scans)
+    coverage = _cover(scans, refinements, lost + unsettled, budget.exhausted)
+    return Census(fixed, energy, max_period, tuple(orbits), coverage)
+
+
+def _cover(scans: list[Scan], refinements: int, doubtful: int, exhausted: bool) -> Coverage:
+    """The sums over all places."""
+    doubtful += sum(len(one.open_cells) + abs(one.winding - one.degree) for one in scans)
+    return Coverage(
         theta2_points=sum(one.motions for one in scans),
         time_points=max(one.rows for one in scans),
         refinements=refinements,
-        suspicious_cells=sum(len(one.open_cells) for one in scans) + lost + parted + unsettled,
+        suspicious_cells=doubtful,
         winding=sum(one.winding for one in scans),
         degree=sum(one.degree for one in scans),
-        slices=len(circles),
-        exhausted=budget.exhausted,
+        slices=len(scans),
+        exhausted=exhausted,
     )
-    return Census(fixed, energy, max_period, tuple(orbits), coverage)
 
 
 def _circles(scaled: Pendulum, energy: float, fixed: Pendulum) -> list[Passages]:
@@ -136,8 +142,10 @@ def _circles(scaled: Pendulum, energy: float, fixed: Pendulum) -> list[Passages]
     levels = [
         -upper * math.cos(n1 * math.pi) - lower * math.cos(n2 * math.pi) for n1, n2 in _PLACES
     ]
+    highest = (energy / unit - levels[0]) / (levels[-1] - levels[0])
+    faster = math.sqrt(max(highest, 1.0))
     circles = [
-        Passages(scaled, place, float(energy / unit - level))
+        Passages(scaled, place, float(energy / unit - level), faster)
         for place, level in zip(_PLACES, levels, strict=True)
         if energy / unit > level
     ]

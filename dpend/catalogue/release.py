@@ -159,11 +159,15 @@ def _check_angle(theta1: Any) -> float:
     return value
 
 
-def check_period(pendulum: Pendulum, max_period: Any) -> float:
-    """`max_period`, refused where no scan reaches, and pendulums that float64 cannot hold."""
+def check_period(pendulum: Pendulum, max_period: Any, faster: float = 1.0) -> float:
+    """`max_period`, refused where no scan reaches, and pendulums that float64 cannot hold.
+
+    `faster`: the speeds of the motions over those of releases.
+    """
     value = known_number("max_period", max_period, positive=True, unit="s")
     _check_scales(pendulum)
-    most = 2 * longest(jax.tree.map(float, natural(pendulum))) * math.sqrt(pendulum.l1 / pendulum.g)
+    second = math.sqrt(pendulum.l1 / pendulum.g)
+    most = 2 * longest(jax.tree.map(float, natural(pendulum))) * second / faster
     if value > most:
         raise ValueError(
             f"max_period must be at most {most:.4g} s for this pendulum, got {value:g}: ask for "

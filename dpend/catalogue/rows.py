@@ -28,7 +28,8 @@ from dpend.methods.scheme import Scheme
 _METHOD = Scheme("rk8-circle", 1.0, written_out=False)
 # Rows that one launch computes.
 _WINDOW = 64
-# The fast mode advances by this between rows [rad], before a scan makes the rows denser.
+# The fast mode advances by this between rows [rad], less where motions are faster than releases,
+# before a scan makes the rows denser.
 _ROW = 0.05
 # Releases with the upper rod upright or hanging to within this [rad] share a column of equilibria.
 _AT_EQUILIBRIUM = 1e-12
@@ -36,11 +37,6 @@ _AT_EQUILIBRIUM = 1e-12
 
 class TooCoarse(Exception):
     """The rows lie too far apart for the motion."""
-
-
-def rows_for(pendulum: Pendulum, duration: float) -> int:
-    """How many rows a scan begins with, a whole number of launches."""
-    return _WINDOW * math.ceil(duration * float(fast_frequency(pendulum)) / _ROW / _WINDOW)
 
 
 class Releases(NamedTuple):
@@ -53,6 +49,11 @@ class Releases(NamedTuple):
     def turns(self) -> int:
         """How often G goes round zero at t = 0, anticlockwise, as the angle goes round."""
         return 0
+
+    @property
+    def faster(self) -> float:
+        """The largest speeds, over those of the fastest release."""
+        return 1.0
 
     def rows(self, dt: float, rows: int, angles: np.ndarray, coarse: bool) -> np.ndarray:
         """G of these motions: value, slopes in time and in the angle, and mixed, shape (4, 2, rows
@@ -74,11 +75,14 @@ class Releases(NamedTuple):
 class Passages(NamedTuple):
     """The motions that start at pi (n1, n2) with this kinetic energy and the momenta p = sqrt(2 K)
     L (cos angle, sin angle), L L^T being the inertia there; all in natural units.
+
+    `faster`: their largest speeds, over those of the fastest release, or one.
     """
 
     pendulum: Pendulum
     place: tuple[int, int]
     kinetic: float
+    faster: float
 
     @property
     def turns(self) -> int:
@@ -118,6 +122,12 @@ class Passages(NamedTuple):
 
 # Where the motions of a scan start.
 Circle: TypeAlias = Releases | Passages
+
+
+def rows_for(circle: Circle, duration: float) -> int:
+    """How many rows a scan begins with, a whole number of launches."""
+    rate = circle.faster * float(fast_frequency(circle.pendulum))
+    return _WINDOW * math.ceil(duration * rate / _ROW / _WINDOW)
 
 
 def _quotients(

@@ -156,7 +156,7 @@ def scan_circle(circle: Circle, duration: float, intervals: int, budget: Budget)
         duration: in natural units, at most `longest`.
         budget: what the scan, and others, may spend.
     """
-    rows = rows_for(circle.pendulum, duration)
+    rows = rows_for(circle, duration)
     while 2 * rows <= _MOST_ROWS:
         try:
             return _Scanner(circle, duration / rows, rows, False, budget).run(intervals)
@@ -171,7 +171,7 @@ def foresee(circle: Circle, duration: float) -> Outlook:
     The slope's mean over the angle, against the usual size of G, is the number of waves. It grows
     like the distance of neighbouring motions, and intervals must be as narrow as the waves.
     """
-    rows = rows_for(circle.pendulum, duration)
+    rows = rows_for(circle, duration)
     probes = np.linspace(-np.pi, np.pi, _PROBES + 1)
     value, _, slope, _ = circle.rows(duration / rows, rows, probes, True)
     with np.errstate(all="ignore"):

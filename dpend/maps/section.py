@@ -27,7 +27,8 @@ from dpend.status import Status
 # before a picture shows it, and regular motions stay on their curves for thousands of crossings.
 _TOLERANCE = 1e-9
 # The plastic number's powers: multiples of them modulo 1 fill a square evenly, each new point in
-# the largest gap (the R2 sequence, Roberts 2018).
+# the largest gap (the R2 sequence of Martin Roberts, The Unreasonable Effectiveness of
+# Quasirandom Sequences, extremelearning.com.au, 2018).
 _PLASTIC = 1.3247179572447460
 # Points of that sequence that are tried at once, always as many: one compiled program.
 _TRIED = 4096

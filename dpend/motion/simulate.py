@@ -159,9 +159,10 @@ def _span(
                 "duration must be given where times are not, got None: give one of them"
             )
         known = _check_duration(duration)
+        end = duration if isinstance(duration, jax.core.Tracer) else known
         if every is not None:
-            return duration, None
-        return duration, np.linspace(0.0, 1.0, _count_times(pendulum, state, known)) * duration
+            return end, None
+        return end, np.linspace(0.0, 1.0, _count_times(pendulum, state, known)) * end
     traced = isinstance(times, jax.core.Tracer)
     grid = jnp.atleast_1d(jnp.asarray(times, jnp.float64)) if traced else check_times(times)
     if duration is None:
@@ -172,7 +173,7 @@ def _span(
             f"times must lie between zero and the duration of {known:g} s, got {shown(grid)}: "
             f"give a longer duration, or none"
         )
-    return duration, grid
+    return duration if isinstance(duration, jax.core.Tracer) else known, grid
 
 
 def _count_times(pendulum: Pendulum, state: State, duration: float) -> int:

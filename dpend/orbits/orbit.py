@@ -9,26 +9,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from dpend.checks import Scalar, known_value
+from dpend.checks import Scalar, known_value, shown
 from dpend.mechanics.pendulum import Pendulum, State
-from dpend.mechanics.units import natural
+from dpend.motion.trajectory import TOLERANCE, Trajectory
 from dpend.orbits.arc import PARTS, state_halfway
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.implicit import (
     ArcGiven,
     Known,
-    PieceGiven,
     arc_equations,
     implicit,
-    know_piece,
     know_solved,
     parameters_of,
-    piece_equations,
 )
 from dpend.orbits.newton import Solved
-from dpend.orbits.single import FINE, Line, clock, rate_along, steps_for
+from dpend.orbits.path import unfold
 from dpend.orbits.stability import OPPOSITE, stability_class
 from dpend.records import Quantities, frame, outcome, quantities, span, variables
 from dpend.status import Status
@@ -164,6 +161,38 @@ def orbit_quantities(orbits: PeriodicOrbit) -> Quantities:
         quantities(flat.state) | quantities(flat, names) | parts | dual | quantities(flat.pendulum)
     )
 
+    def trajectory(
+        self, times: Any | None = None, *, tolerance: float | Any = TOLERANCE
+    ) -> Trajectory:
+        """The motion of a single orbit at `times`, any number of periods on or back.
+
+        It never parts from the orbit, however unstable that is: it starts anew from the states at
+        t = 0 and T/2, and each piece lasts a quarter of the period.
+
+        Arguments:
+            times: [s], shape (n,), in any order; by default 301 over one period, whose last state
+                is the first (up to full turns).
+            tolerance: wanted error of the angles in a quarter of the period [rad], the orbit's
+                states and period taken as they are.
+        Returns:
+            Trajectory of NumPy arrays. Its status is that of the first piece that failed.
+        Raises:
+            ValueError: many orbits, or one that was not found; times not finite; tolerance not
+                positive.
+        """
+        if np.ndim(self.period) or not np.isfinite(period := float(self.period)):
+            raise ValueError(
+                f"orbit must be a single one that was found, got a period of "
+                f"{shown(self.period)}: take one of them"
+            )
+        pendulum, *starts = (
+            jax.tree.map(float, each) for each in (self.pendulum, self.state, self.dual)
+        )
+        # Of a centred orbit `turns` tells of the quarter; it comes back without any.
+        moving = self.symmetry in ("passing", "none")
+        turns = [int(turn) * moving for turn in self.turns]
+        return unfold(pendulum, (starts[0], starts[1]), period, turns, times, tolerance)
+
 
 def mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
     """The mirror image x -> -x where `sign`, of the leaves' shape, is -1."""
@@ -245,33 +274,6 @@ def _constant(value: Any) -> Any:
 
 
 _halfway = jax.jit(state_halfway)
-
-
-@jax.jit
-def slopes(orbit: PeriodicOrbit) -> Float[Array, "4 6"]:
-    """Derivatives of what is known of a centred orbit by the implicit function theorem, without
-    solving it again.
-
-    Returns:
-        Of theta2, log T, kappa and log |kappa| (rows) with respect to l1, l2, m1, m2, g and theta1.
-    """
-    pendulum, origin, direction = orbit.pendulum, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
-    second = jnp.sqrt(pendulum.l1 / pendulum.g)
-    root = jnp.stack([orbit.theta2, jnp.log(orbit.period / (PARTS["centred"] * second))])
-    scaled, line = natural(pendulum), Line(orbit.theta1 * origin, direction)
-    rate, _ = rate_along(scaled, line, root[0], root[1], steps_for(root[1], clock(scaled), FINE))
-    steps = steps_for(root[1], rate, FINE).astype(jnp.float64)
-    given, equations = PieceGiven(origin, direction, steps), piece_equations("centred")
-    found = know_piece("centred", root, parameters_of(pendulum, orbit.theta1), given)
-
-    def known(parameters: Array) -> Array:
-        here = Pendulum(*parameters[:5])
-        _, columns = implicit(equations, (root, found), parameters_of(here, parameters[5]), given)
-        of = Known(*columns)
-        log_period = jnp.log(of.time) + 0.5 * jnp.log(here.l1 / here.g)
-        return jnp.stack([of.theta2, log_period, of.kappa, of.log_abs_kappa])
-
-    return jax.jacfwd(known)(jnp.stack([*jax.tree.leaves(pendulum), orbit.theta1]))
 
 
 class Slopes(NamedTuple):

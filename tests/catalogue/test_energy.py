@@ -52,12 +52,24 @@ def test_signs_add_up_to_the_winding_number(place, kinetic):
     scaled = jax.tree.map(float, pendulum)
     counts = set()
     for intervals in (256, 400):
-        result = scan_circle(Passages(scaled, place, kinetic), 4.0, intervals, Budget(10**9))
+        result = scan_circle(Passages(scaled, place, kinetic, 1.0), 4.0, intervals, Budget(10**9))
         assert result.degree == result.winding
         assert not result.open_cells
         counts.add(len(result.zeros))
     assert len(counts) == 1
     assert counts != {0}
+
+
+@pytest.mark.slow
+def test_fast_motions_are_looked_at_more_often(unit):
+    """At E = 30 a scan as coarse as one of releases never decides some cells, whose zeros lie on
+    slopes that are flat along the angle.
+    """
+    census = dpend.find_orbits(unit, energy=30.0, max_period=3.0, symmetry="passing")
+    assert census.coverage.suspicious_cells == 0
+    assert census.coverage.winding == census.coverage.degree
+    with pytest.raises(ValueError, match="max_period must be at most 47"):
+        dpend.find_orbits(unit, energy=30.0, max_period=50.0, symmetry="passing")
 
 
 @pytest.mark.slow

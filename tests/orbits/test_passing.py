@@ -30,15 +30,20 @@ def columns(state):
     return np.stack([np.asarray(leaf, float) for leaf in jax.tree.leaves(state)])
 
 
+def motion(orbit):
+    """The states at sixtieths of the period, by diffrax, as columns."""
+    start = State(*map(float, columns(orbit.state)))
+    times = np.arange(1, 61) / 60 * float(orbit.period)
+    return columns(dpend.reference(orbit.pendulum, start, times, error=False).state)
+
+
 def assert_comes_back(orbit, atol=1e-9):
     """By diffrax: after half the period at the dual, after the whole where it began, but for full
-    turns; kappa is that of the monodromy in one piece.
+    turns; kappa is that of the monodromy in one piece. The states at both times.
     """
-    period = float(orbit.period)
-    start = State(*map(float, columns(orbit.state)))
-    end = columns(dpend.reference(orbit.pendulum, start, [period / 2, period], error=False).state)
+    end = motion(orbit)[:, [29, 59]]
     np.testing.assert_allclose(end[:, 0], columns(orbit.dual), atol=atol)
-    turned = end[:, 1] - columns(start)
+    turned = end[:, 1] - columns(orbit.state)
     turned[:2] -= 2 * math.pi * np.round(turned[:2] / (2 * math.pi))
     np.testing.assert_allclose(turned, 0, atol=atol)
     kappa = (np.trace(monodromy(orbit, 1.0)) - 2) / 2
@@ -76,18 +81,11 @@ def test_an_orbit_without_symmetry(unit):
     np.testing.assert_allclose(orbit.energy, energy, atol=1e-12)
     assert_comes_back(orbit)
     assert orbit.turns == (0, 0)
-    states = columns(
-        dpend.reference(
-            unit,
-            State(*map(float, columns(orbit.state))),
-            np.linspace(0, 1, 400)[1:] * float(orbit.period),
-            error=False,
-        ).state
-    )
+    states = motion(orbit)
     scale = np.max(np.abs(states), axis=1)[:, None]
     for image in ([-1, -1, -1, -1], [1, 1, -1, -1], [-1, -1, 1, 1]):
         of_first = np.array(image)[:, None] * states[:, :1]
-        assert np.min(np.max(np.abs(states - of_first) / scale, axis=0)) > 0.05
+        assert np.min(np.max(np.abs(states - of_first) / scale, axis=0)) > 0.15
 
 
 def test_from_anywhere_on_an_orbit_and_twice_around_it(unit):
@@ -95,10 +93,8 @@ def test_from_anywhere_on_an_orbit_and_twice_around_it(unit):
     it is, also where the period given is that of two; the energy or the period is kept.
     """
     known = dpend.find_orbit(unit, 1.5, branch="in-phase")
-    start = State(*map(float, columns(known.state)))
     period = float(known.period)
-    later = dpend.reference(unit, start, [0.3 * period], error=False).state
-    there = State(*(float(leaf[0]) for leaf in jax.tree.leaves(later)))
+    there = State(*map(float, motion(known)[:, 17]))
     for keep, covers in (("energy", 1), ("period", 2)):
         orbit = dpend.find_orbit(unit, state=there, period=covers * period, keep=keep)
         assert (orbit.symmetry, int(orbit.status)) == ("centred", Status.CONVERGED)
@@ -108,7 +104,7 @@ def test_from_anywhere_on_an_orbit_and_twice_around_it(unit):
 
 
 def test_what_comes_to_nothing_says_so(unit):
-    """Full turns that no motion of this energy makes; the pendulum at rest."""
+    """Full turns that no orbit near the motion makes; the pendulum at rest."""
     passing = passage(0.0, 0, 1.716424)
     far = dpend.find_orbit(unit, state=passing, period=2.95, symmetry="passing", turns=(5, -7))
     assert far.status in (Status.MAX_ITERATIONS, Status.NONFINITE)
