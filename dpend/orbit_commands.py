@@ -59,7 +59,9 @@ def orbit(
     theta1: Theta1,
     branch: Annotated[
         str | None,
-        typer.Option(help="in-phase or anti-phase; both, if neither this nor a guess is given."),
+        typer.Option(
+            metavar="|".join(BRANCHES), help="Both, if neither this nor a guess is given."
+        ),
     ] = None,
     theta2: Annotated[
         float | None, numeric(help="Guess of the lower rod's release angle [deg].")
@@ -173,6 +175,7 @@ def family(
         typer.Option(
             "--branch",
             "--from",
+            metavar="|".join(FAMILIES),
             help="in-phase (slow mode), anti-phase (fast mode), or of a saddle: down-up (lower rod "
             "upright), up-down (upper rod upright).",
         ),
@@ -301,7 +304,7 @@ def design(
     theta1: Theta1,
     branch: Annotated[
         str | None,
-        typer.Option(help="in-phase or anti-phase: whose orbit --period and --kappa are about."),
+        typer.Option(metavar="|".join(BRANCHES), help="Whose --period and --kappa are meant."),
     ] = None,
     period: Annotated[float | None, numeric(help="Wanted period [s].")] = None,
     kappa: Annotated[
