@@ -20,7 +20,7 @@ from dpend.catalogue.release import find_brake_orbits as find_brake_orbits
 from dpend.catalogue.survey import find_brake_families as find_brake_families
 from dpend.inverse.design import Design as Design
 from dpend.inverse.design import design_pendulum as design_pendulum
-from dpend.inverse.fit import Fit as Fit
+from dpend.inverse.estimates import Fit as Fit
 from dpend.inverse.fit import fit_parameters as fit_parameters
 from dpend.inverse.measurements import load_angles as load_angles
 from dpend.machine import configure as configure
@@ -65,6 +65,8 @@ from dpend.motion.simulate import simulate as simulate
 from dpend.motion.trajectory import Trajectory as Trajectory
 from dpend.orbits.continuation import follow_family as follow_family
 from dpend.orbits.family import Family as Family
+from dpend.orbits.files import load_orbits as load_orbits
+from dpend.orbits.files import save_orbits as save_orbits
 from dpend.orbits.find import find_orbit as find_orbit
 from dpend.orbits.orbit import PeriodicOrbit as PeriodicOrbit
 from dpend.orbits.samples import SpecialPoint as SpecialPoint

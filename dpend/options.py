@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from dpend._version import __version__
 from dpend.checks import number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
@@ -103,8 +104,17 @@ app = typer.Typer(
 )
 
 
+def _tell_version(asked: bool | None) -> None:
+    if asked:
+        typer.echo(f"dpend {__version__}")
+        raise typer.Exit
+
+
+_VERSION = typer.Option("--version", callback=_tell_version, is_eager=True, help="Its version.")
+
+
 @app.callback()
-def _commands() -> None:
+def _commands(version: Annotated[bool | None, _VERSION] = None) -> None:
     """Keeps `dpend orbit` a subcommand."""
 
 

@@ -35,6 +35,7 @@ from dpend.options import (
     numeric,
     radians,
 )
+from dpend.orbits.files import orbit_record, orbits_record
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, FAMILIES, PeriodicOrbit
 from dpend.places import check_place, replacing
@@ -43,7 +44,6 @@ from dpend.report import (
     converged,
     design_record,
     family_record,
-    orbit_record,
     print_atlas,
     print_design,
     print_family,
@@ -60,7 +60,9 @@ def orbit(
     theta1: Theta1,
     branch: Annotated[
         str | None,
-        typer.Option(help="in-phase or anti-phase; both, if neither this nor a guess is given."),
+        typer.Option(
+            metavar="|".join(BRANCHES), help="Both, if neither this nor a guess is given."
+        ),
     ] = None,
     theta2: Annotated[
         float | None, numeric(help="Guess of the lower rod's release angle [deg].")
@@ -117,7 +119,7 @@ def orbit(
     records = [
         orbit_record(orbit) | ({"branch": name} if name else {}) for name, orbit in found.items()
     ]
-    record = {"orbits": records} if both else records[0]
+    record = orbits_record(records, both)
     _write(record, out, formats)
     return record, partial(print_orbits, pendulum, records, out), converged(*found.values())
 
@@ -162,6 +164,7 @@ def family(
         typer.Option(
             "--branch",
             "--from",
+            metavar="|".join(FAMILIES),
             help="in-phase (slow mode), anti-phase (fast mode), or of a saddle: down-up (lower rod "
             "upright), up-down (upper rod upright).",
         ),
@@ -290,7 +293,7 @@ def design(
     theta1: Theta1,
     branch: Annotated[
         str | None,
-        typer.Option(help="in-phase or anti-phase: whose orbit --period and --kappa are about."),
+        typer.Option(metavar="|".join(BRANCHES), help="Whose --period and --kappa are meant."),
     ] = None,
     period: Annotated[float | None, numeric(help="Wanted period [s].")] = None,
     kappa: Annotated[

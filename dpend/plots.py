@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from dpend.checks import instance, integer, one_of, shown, single
-from dpend.inverse.fit import Fit
+from dpend.inverse.estimates import Fit
 from dpend.map_picture import LABELS, draw_map
 from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
 from dpend.motion.trajectory import Trajectory

@@ -10,7 +10,7 @@ import functools
 import json
 import math
 import re
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,12 @@ _SUFFIXES = {
     "kg m^2/s": "_kg_m2_s",
     "s": "_s",
     "J": "_J",
+}
+
+# How files tell what the numbers of a status mean (the CF conventions, section 3.5).
+_FLAGS = {
+    "flag_values": np.array(list(Status), np.uint8),
+    "flag_meanings": " ".join(one.name.lower() for one in Status),
 }
 
 
@@ -97,19 +103,76 @@ def columns(result: Any, names: str = "") -> dict[str, list[Any]]:
     return found
 
 
-def variables(result: Any, dim: str | tuple[str, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The fields of a result as xarray takes them, in SI over `dim`, and angles in degrees as
-    coordinates beside.
-    """
+# Values in SI by name, each with its unit.
+Quantities: TypeAlias = dict[str, tuple[np.ndarray, str]]
+
+
+def quantities(result: Any, names: str = "") -> Quantities:
+    """Some fields and properties of a result as arrays, or all fields, each with its unit."""
     units = units_of(type(result))
-    values = {name: np.asarray(getattr(result, name)) for name in units}
-    data = {name: (dim, value, {"units": units[name]}) for name, value in values.items()}
+    return {
+        name: (np.asarray(getattr(result, name)), units.get(name, ""))
+        for name in names.split() or units
+    }
+
+
+def frame(table: Quantities) -> Any:
+    """Quantities of one shape (n,) as a `pandas.DataFrame` with the names and the units of files:
+    angles in degrees, the status by its name.
+    """
+    import pandas
+
+    columns = {file_name(name, unit): file_value(of, unit) for name, (of, unit) in table.items()}
+    if "status" in columns:
+        columns["status"] = [Status(int(one)).name.lower() for one in columns["status"]]
+    return pandas.DataFrame(columns)
+
+
+def variables(
+    table: Quantities, dim: str | tuple[str, ...]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Quantities as xarray takes them, in SI over `dim`, and angles in degrees as coordinates
+    beside.
+    """
+    data: dict[str, Any] = {}
+    for name, (value, unit) in table.items():
+        data[name] = (dim, value, {"units": unit} if unit else {})
+        if name == "status":
+            data[name] = (dim, value.astype(np.uint8), _FLAGS)
     degrees = {
         f"{name}_deg": (dim, np.degrees(value), {"units": "degree"})
-        for name, value in values.items()
-        if units[name] == "rad"
+        for name, (value, unit) in table.items()
+        if unit == "rad" and not name.endswith(("error", "noise"))
     }
     return data, degrees
+
+
+def span(name: str, value: Any, unit: str = "") -> str:
+    """A number as a `repr` shows it, of many the least and the greatest; of what is traced, or
+    stands for a number, only its name.
+    """
+    try:
+        known = np.asarray(value, float)
+    except (TypeError, ValueError):
+        return name
+    known = known[np.isfinite(known)] if known.ndim else known
+    if not known.size:
+        return f"{name} unknown"
+    ends = [f"{known.min():.6g}", f"{known.max():.6g}"]
+    text = ends[0] if ends[0] == ends[1] else " to ".join(ends)
+    return f"{name} {text} {unit}".rstrip()
+
+
+def outcome(status: Any) -> str:
+    """A status as a `repr` shows it, of many how often each."""
+    try:
+        values, counts = np.unique(np.asarray(status, int), return_counts=True)
+        names = [Status(value).name.lower() for value in values.tolist()]
+    except (TypeError, ValueError):
+        return "status"
+    if np.ndim(status) == 0:
+        return names[0]
+    return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True))
 
 
 def parse_json(text: str) -> Any:

@@ -13,7 +13,7 @@ import dpend
 from dpend.mechanics.pendulum import Pendulum
 from dpend.motion.trajectory import Trajectory
 from dpend.orbits.arc import RELEASED_SYMMETRIES
-from dpend.orbits.orbit import PeriodicOrbit
+from dpend.orbits.files import orbit_record
 from dpend.records import columns, json_text, record
 from dpend.status import Status
 from dpend.tables import print_table
@@ -28,16 +28,6 @@ _SLOPES = {
 }
 # The same as columns of the table, with their headings.
 _SLOPE_HEADINGS = {"period_s": "period (s)", "kappa": "kappa", "theta2_deg": "theta2 (deg)"}
-
-
-def orbit_record(orbit: PeriodicOrbit) -> dict[str, Any]:
-    names = "period energy residual iterations status message symmetry kappa log_abs_kappa"
-    return {
-        **record(orbit.state),
-        **record(orbit, f"{names} stability"),
-        "dual": record(orbit.dual),
-        **record(orbit, "turns error_estimate pendulum"),
-    }
 
 
 def family_record(family: dpend.Family, branch: str | None) -> dict[str, Any]:

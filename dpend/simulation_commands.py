@@ -120,7 +120,7 @@ def map_command(
         numeric(help="Wanted error of the angles [rad]; 1e-6 if no method is given either."),
     ] = None,
     method: Annotated[
-        str | None, typer.Option(help=f"One of {', '.join(METHODS)}, with --step.")
+        str | None, typer.Option(metavar="|".join(METHODS), help="With --step.")
     ] = None,
     step: Annotated[float | None, numeric(help="Step [s], with --method.")] = None,
     error: Annotated[

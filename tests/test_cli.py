@@ -545,7 +545,9 @@ def test_a_file_that_holds_no_orbit_is_refused(capsys, tmp_path):
     names = {"l1_m": 0.2, "l2_m": 0.2, "m1_kg": 0.1, "m2_kg": 0.1, "g_m_s2": 9.8}
     state = {"theta1_deg": 0, "theta2_deg": 0.0, "p1_kg_m2_s": -0.0141, "p2_kg_m2_s": 0.0409}
     right = {**state, "period_s": 0.42, "status": "converged", "symmetry": "passing",
-             "turns": [0, 1], "dual": state, "pendulum": names}  # fmt: skip
+             "turns": [0, 1], "dual": state, "pendulum": names, "energy_J": -0.5, "residual": 0.0,
+             "iterations": 3, "kappa": 2.0, "log_abs_kappa": 0.7,
+             "error_estimate": {"theta2_deg": 0.0, "period_s": 0.0}}  # fmt: skip
     file = tmp_path / "o.json"
     wrong = [
         ("period_s", -1, "period_s must be"),

@@ -836,6 +836,17 @@ DOORS = {
         },
         "dpend.proofs.ledger.require_flint",
     ),
+    "load_orbits": Door(
+        dpend.load_orbits, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}
+    ),
+    "save_orbits": Door(
+        dpend.save_orbits,
+        {"orbits": ORBIT, "path": "F.json"},
+        {
+            "orbits": kind([None, PAPER, *NO_CHOICES, *NO_OBJECTS]),
+            "path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"]),
+        },
+    ),
     "load_angles": Door(dpend.load_angles, {}, {"path": PATH}),
     "Atlas.save": Door(EMPTY.save, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}),
     "Atlas.where": Door(

@@ -26,16 +26,16 @@ chaos
 maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.sweep
 maps.section maps.returns maps.periodic maps.rotation
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
-orbits.search orbits.curve orbits.follow orbits.path orbits.orbit orbits.samples orbits.zones
-orbits.special orbits.passages orbits.through orbits.find orbits.family orbits.branching
-orbits.continuation
+orbits.search orbits.curve orbits.follow orbits.path orbits.orbit orbits.derivatives orbits.samples
+orbits.zones orbits.special orbits.passages orbits.files orbits.through orbits.find orbits.family
+orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey
 proofs.decimals proofs.balls proofs.taylor proofs.flow proofs.proof proofs.facts proofs.digits
 proofs.certificate proofs.certify proofs.ledger
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
-inverse.fit inverse.problem inverse.nearest inverse.design
+inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
 map_picture section_picture plots animate tables report writing reading terminal options
 orbit_commands proof_commands simulation_commands section_commands cli

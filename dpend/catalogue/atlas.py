@@ -19,7 +19,7 @@ from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.orbit import PeriodicOrbit
 from dpend.places import check_place, file_path, replacing
-from dpend.records import json_text, record
+from dpend.records import Quantities, frame, json_text, outcome, record, span, variables
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,29 @@ class Atlas:
 
     def __len__(self) -> int:
         return len(self.table["period"])
+
+    def __repr__(self) -> str:
+        families = f"{len(self.families)} families, " if self.families else ""
+        told = f"{span('period', self.table['period'], 's')}, {outcome(self.table['status'])}"
+        suspicious = f"{self.coverage.suspicious_cells} suspicious cells"
+        return f"<Atlas: {len(self)} orbits, {families}{told}, {suspicious}>"
+
+    def to_dataframe(self) -> Any:
+        """The table with the names and the units of files: angles in degrees."""
+        return frame(self._quantities())
+
+    def to_xarray(self) -> Any:
+        """The table as an `xarray.Dataset` over `orbit`: radians and SI units, the angles in
+        degrees as coordinates.
+        """
+        import xarray
+
+        data, degrees = variables(self._quantities(), "orbit")
+        return xarray.Dataset(data, degrees, {"max_period_s": self.max_period})
+
+    def _quantities(self) -> Quantities:
+        units = {name: "rad" if unit == "deg" else unit for name, unit in UNITS.items()}
+        return {name: (column, units.get(name, "")) for name, column in self.table.items()}
 
     @property
     def orbits(self) -> tuple[PeriodicOrbit, ...]:

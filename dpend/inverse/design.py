@@ -32,6 +32,7 @@ from dpend.inverse.problem import PARAMETERS, DesignProblem, Look
 from dpend.mechanics.pendulum import Pendulum, check_pendulum
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
+from dpend.records import outcome, span
 from dpend.status import message
 
 GOALS = ("zero", "minimum")
@@ -86,6 +87,28 @@ class Design:
     def message(self) -> str:
         """The sentence that says what its status means."""
         return message(self.status)
+
+    def to_dataframe(self) -> Any:
+        """A row for each of its orbits, see `PeriodicOrbit.to_dataframe`."""
+        return self._stacked().to_dataframe()
+
+    def to_xarray(self) -> Any:
+        """Its orbits, see `PeriodicOrbit.to_xarray`, with their sensitivities over `orbit` and
+        `parameter`.
+        """
+        found = self._stacked().to_xarray()
+        for of in ("theta2", "period", "kappa"):
+            rows = np.array([np.atleast_1d(row) for row in self.sensitivities[of].values()])
+            found[f"{of}_sensitivity"] = (("parameter", "orbit"), rows)
+        return found.assign_coords(parameter=list(self.sensitivities["period"]))
+
+    def _stacked(self) -> PeriodicOrbit:
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *self.orbits)
+
+    def __repr__(self) -> str:
+        told = ", ".join(span(name, of) for name, of in vars(self.pendulum).items())
+        loss = f"{span('loss', self.loss)}, {span('iterations', self.iterations)}"
+        return f"<Design: {told}, {loss}, {outcome(self.status)}>"
 
 
 # The public signature asks for more than seven parameters.

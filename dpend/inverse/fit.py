@@ -14,15 +14,15 @@ held.
 """
 
 import math
-from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dpend._runtime import require_float64
-from dpend.checks import Scalar, known_number, several, shown
+from dpend.checks import known_number, several, shown
+from dpend.inverse.estimates import Fit
 from dpend.inverse.gauss_newton import Found, close_joints, refine
 from dpend.inverse.measurements import FEWEST, Angles, check_angles, wrap
 from dpend.inverse.search import FIRST, MOSTLY, all_at_once, smooth_start, window_by_window
@@ -48,7 +48,6 @@ from dpend.mechanics.pendulum import (
     known_pendulum,
     momenta,
 )
-from dpend.records import units_of
 from dpend.status import Status
 
 # How a free field moves the logarithms of l2/l1, m2/m1 and g/l1.
@@ -57,62 +56,6 @@ RATIOS = ("l2/l1", "m2/m1", "g/l1")
 INITIAL = ("theta1", "theta2", "omega1", "omega2")
 # Of two lengths or masses: beyond this ratio rounding hides what the lighter or shorter one does.
 _MOST_UNEQUAL = 1e9
-
-
-# The units of what is estimated.
-_ESTIMATED = units_of(Pendulum) | units_of(State)
-_ESTIMATED |= {"l2/l1": "", "m2/m1": "", "g/l1": "1/s^2", "omega1": "rad/s", "omega2": "rad/s"}
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Fit:
-    """A pendulum fitted to measured angles.
-
-    Attributes:
-        pendulum: with the estimated values of the free fields.
-        state: at the first time.
-        estimates: of the free fields [SI], of the ratios `l2/l1`, `m2/m1` and `g/l1` [1/s^2], and
-            of the state at the first time, `theta1`, `theta2` [rad], `omega1`, `omega2` [rad/s].
-        standard_errors: of the same, from the Jacobian of the constrained problem and the noise; 0
-            for what was held, infinity for what the data do not determine, NaN where there was
-            nothing to compute them from.
-        covariance: of the free fields, then of theta1, theta2, omega1, omega2, in this order, shape
-            (n, n).
-        time: the times [s], shape (m,).
-        theta1, theta2: the fitted motion there [rad], continuous.
-        residual1, residual2: measured minus fitted, modulo full turns [rad]; NaN where nothing was
-            measured.
-        noise: standard deviation of the measured angles about the fit [rad].
-        expected_noise: as given, or as local cubics through the data leave it [rad].
-        gap: the largest miss at a joint of two windows [rad, rad/s].
-        windows: how many there were.
-        iterations: how often the motion was linearised.
-        error_estimate: the largest change of a free field, relative, on going on at half the
-            integration step.
-        status: a value of `Status`: `MISFIT` where the residuals are far above the expected noise
-            or correlated, `SINGULAR` where something asked for is not determined.
-        free: the names of the free fields.
-    """
-
-    pendulum: Pendulum
-    state: State
-    estimates: Annotated[dict[str, Scalar], _ESTIMATED]
-    standard_errors: Annotated[dict[str, Scalar], _ESTIMATED]
-    covariance: Scalar
-    time: Scalar
-    theta1: Scalar
-    theta2: Scalar
-    residual1: Scalar
-    residual2: Scalar
-    noise: Annotated[Scalar, "rad"]
-    expected_noise: Annotated[Scalar, "rad"]
-    gap: Scalar
-    windows: Scalar
-    iterations: Scalar
-    error_estimate: Scalar
-    status: Scalar
-    free: tuple[str, ...] = field(metadata={"static": True})
 
 
 def fit_parameters(

@@ -12,8 +12,9 @@ import numpy as np
 
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum, hamiltonian, released
+from dpend.orbits.derivatives import slopes
 from dpend.orbits.find import find_orbit
-from dpend.orbits.orbit import PeriodicOrbit, slopes
+from dpend.orbits.orbit import PeriodicOrbit
 from dpend.status import Status
 
 Loss = Callable[..., Any]

@@ -11,7 +11,7 @@ from dpend.checks import Scalar, numbers, shown
 from dpend.mechanics.pendulum import State
 from dpend.methods.scheme import Scheme
 from dpend.motion.estimate import MARGIN, PARTED
-from dpend.records import variables
+from dpend.records import frame, outcome, quantities, span, variables
 from dpend.status import Status, message
 
 # The error that is asked for by default [rad].
@@ -88,9 +88,10 @@ class Trajectory:
         import xarray
 
         lanes = ("lane",) if np.ndim(self.status) else ()
-        data, degrees = variables(self.state, (*lanes, "time"))
+        saved = quantities(self.state)
         if np.ndim(self.error):
-            data["error"] = ((*lanes, "time"), np.asarray(self.error), {"units": "rad"})
+            saved |= quantities(self, "error")
+        data, degrees = variables(saved, (*lanes, "time"))
         told = {
             "energy_drift": np.asarray(self.energy_drift, float),
             "error_estimate_rad": np.asarray(self.error_estimate, float),
@@ -98,18 +99,33 @@ class Trajectory:
         }
         attributes: dict[str, Any] = {"tolerance_rad": float(self.tolerance), "method": self.method}
         if lanes:
-            status = np.asarray(self.status, np.uint8)
-            meanings = {
-                "flag_values": np.array(list(Status), np.uint8),
-                "flag_meanings": " ".join(one.name.lower() for one in Status),
-            }
             data |= {name: (lanes, value) for name, value in told.items()}
-            data["status"] = (lanes, status, meanings)
+            data |= variables(quantities(self, "status"), lanes)[0]
         else:
             attributes |= {name: value.item() for name, value in told.items()}
             attributes["status"] = Status(int(self.status)).name.lower()
         time = ("time", np.asarray(self.time), {"units": "s"})
         return xarray.Dataset(data, {"time": time, **degrees}, attributes)
+
+    def to_dataframe(self) -> Any:
+        """A row for each saved time, of many motions also for each `lane`, with the names and the
+        units of files: angles in degrees. `error_deg` is the estimate at this time.
+        """
+        table = quantities(self.state)
+        shape = table["theta1"][0].shape
+        if np.ndim(self.error):
+            table |= quantities(self, "error")
+        table = quantities(self, "time") | table
+        if len(shape) > 1:
+            table = {"lane": (np.arange(shape[0])[:, None], "")} | table
+        flat = {name: (np.broadcast_to(of, shape).ravel(), u) for name, (of, u) in table.items()}
+        return frame(flat)
+
+    def __repr__(self) -> str:
+        many = f"{np.size(self.status)} motions, " if np.ndim(self.status) else ""
+        saved = f"{np.size(self.time)} saved states, {span('time', self.time, 's')}"
+        steps, error = span("steps", self.steps), span("error", self.error_estimate, "rad")
+        return f"<Trajectory: {many}{saved}, {steps}, {error}, {outcome(self.status)}>"
 
 
 def _count_statuses(status: np.ndarray) -> str:

@@ -17,11 +17,20 @@ from dpend.checks import Scalar, at_most_one, integer, known_value, numbers, rea
 from dpend.orbits.curve import Curve
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.newton import METRIC, Solved
-from dpend.orbits.orbit import Held, PeriodicOrbit, Slopes, mirrored, orbits_of, slopes_of
+from dpend.orbits.orbit import (
+    Held,
+    PeriodicOrbit,
+    Slopes,
+    mirrored,
+    orbit_quantities,
+    orbits_of,
+    slopes_of,
+)
 from dpend.orbits.passages import LEVELS, angle_passages, level_passages, onto_level
 from dpend.orbits.samples import SpecialPoint
 from dpend.orbits.special import special_points
 from dpend.orbits.walk import STRAYED
+from dpend.records import Quantities, frame, outcome, span, variables
 from dpend.status import Status, message
 
 # The derivative with respect to theta1 is refused where less than this share of a step along the
@@ -73,6 +82,33 @@ class Family:
     def message(self) -> str:
         """The sentence that says what its status means."""
         return message(self.status)
+
+    def to_dataframe(self) -> Any:
+        """A row for each of its orbits, with the names and the units of files: angles in
+        degrees.
+        """
+        return frame(self._quantities())
+
+    def to_xarray(self) -> Any:
+        """Its orbits as an `xarray.Dataset` over `orbit`, with arclength and the angles in degrees
+        as coordinates: radians and SI units.
+        """
+        import xarray
+
+        data, degrees = variables(self._quantities(), "orbit")
+        attributes = {"ends": " to ".join(self.ends), "status": outcome(self.status)}
+        return xarray.Dataset(data, degrees, attributes).set_coords("arclength")
+
+    def _quantities(self) -> Quantities:
+        return {"arclength": (np.asarray(self.arclength), "")} | orbit_quantities(self.orbits)
+
+    def __repr__(self) -> str:
+        count = f"{np.size(self.arclength)} {self.symmetry} orbits"
+        ends, special = " to ".join(self.ends), f"{len(self.special_points)} special points"
+        period = span("period", self.orbits.period, "s")
+        energy = span("energy", self.orbits.energy, "J")
+        told = ", ".join((ends, special, period, energy, outcome(self.status)))
+        return f"<Family: {count}, {told}>"
 
     def at(
         self,

@@ -1,5 +1,6 @@
 """`PeriodicOrbit`, and how one is made from a root: units, outcome, derivatives."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -8,29 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from dpend.checks import Scalar, known_value, shown
 from dpend.mechanics.pendulum import Pendulum, State
-from dpend.mechanics.units import natural
 from dpend.motion.trajectory import TOLERANCE, Trajectory
 from dpend.orbits.arc import PARTS, state_halfway
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.implicit import (
     ArcGiven,
     Known,
-    PieceGiven,
     arc_equations,
     implicit,
-    know_piece,
     know_solved,
     parameters_of,
-    piece_equations,
 )
 from dpend.orbits.newton import Solved
 from dpend.orbits.path import unfold
-from dpend.orbits.single import FINE, Line, clock, rate_along, steps_for
 from dpend.orbits.stability import OPPOSITE, stability_class
+from dpend.records import Quantities, frame, outcome, quantities, span, variables
 from dpend.status import Status
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -97,9 +94,72 @@ class PeriodicOrbit:
         return self.state.theta2
 
     @property
-    def stability(self) -> str:
-        """`elliptic`, `hyperbolic` or `inverse hyperbolic`, of a single orbit."""
-        return stability_class(float(self.kappa))
+    def stability(self) -> Any:
+        """`elliptic`, `hyperbolic` or `inverse hyperbolic`; of many orbits an array of these."""
+        if not np.ndim(self.kappa):
+            return stability_class(float(self.kappa))
+        kappas = np.asarray(self.kappa)
+        return np.array([stability_class(one) for one in kappas.ravel()]).reshape(kappas.shape)
+
+    def __len__(self) -> int:
+        """How many orbits there are along the first axis."""
+        if not np.ndim(self.period):
+            raise TypeError("a single orbit has no length")
+        return int(np.shape(self.period)[0])
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __getitem__(self, index: Any) -> "PeriodicOrbit":
+        """Some of many orbits, as NumPy's indices choose them; `orbits[3]` is a single one."""
+        shape = np.shape(self.period)
+        if not shape:
+            raise TypeError("a single orbit cannot be indexed")
+
+        def choose(leaf: Any) -> Any:
+            return (jnp if isinstance(leaf, jax.Array) else np).broadcast_to(leaf, shape)[index]
+
+        return jax.tree.map(choose, self)
+
+    def __iter__(self) -> Iterator["PeriodicOrbit"]:
+        return (self[i] for i in range(len(self)))
+
+    def to_dataframe(self) -> Any:
+        """A row for each orbit, with the names and the units of files: angles in degrees."""
+        return frame(orbit_quantities(self))
+
+    def to_xarray(self) -> Any:
+        """The orbits as an `xarray.Dataset` over `orbit`: radians and SI units, the angles in
+        degrees as coordinates.
+        """
+        import xarray
+
+        data, degrees = variables(orbit_quantities(self), "orbit")
+        return xarray.Dataset(data, degrees)
+
+    def __repr__(self) -> str:
+        many = f"{'x'.join(map(str, np.shape(self.period)))} " if np.ndim(self.period) else ""
+        angles = (span(name, getattr(self, name), "rad") for name in ("theta1", "theta2"))
+        told = ", ".join((*angles, span("period", self.period, "s"), span("kappa", self.kappa)))
+        return f"<PeriodicOrbit: {many}{self.symmetry}, {told}, {outcome(self.status)}>"
+
+
+def orbit_quantities(orbits: PeriodicOrbit) -> Quantities:
+    """All that is known of orbits, of each one a row: what a table of them has as columns."""
+    shape, rows = np.shape(orbits.period), int(np.size(orbits.period))
+    flat = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), shape).ravel(), orbits)
+    names = "period energy kappa log_abs_kappa residual iterations status stability"
+    dual = {f"dual_{name}": column for name, column in quantities(flat.dual).items()}
+    parts = {
+        "theta2_error": (flat.error_estimate[0], "rad"),
+        "period_error": (flat.error_estimate[1], "s"),
+        "turns1": (flat.turns[0], ""),
+        "turns2": (flat.turns[1], ""),
+        "symmetry": (np.full(rows, orbits.symmetry), ""),
+    }
+    return (
+        quantities(flat.state) | quantities(flat, names) | parts | dual | quantities(flat.pendulum)
+    )
 
     def trajectory(
         self, times: Any | None = None, *, tolerance: float | Any = TOLERANCE
@@ -214,33 +274,6 @@ def _constant(value: Any) -> Any:
 
 
 _halfway = jax.jit(state_halfway)
-
-
-@jax.jit
-def slopes(orbit: PeriodicOrbit) -> Float[Array, "4 6"]:
-    """Derivatives of what is known of a centred orbit by the implicit function theorem, without
-    solving it again.
-
-    Returns:
-        Of theta2, log T, kappa and log |kappa| (rows) with respect to l1, l2, m1, m2, g and theta1.
-    """
-    pendulum, origin, direction = orbit.pendulum, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
-    second = jnp.sqrt(pendulum.l1 / pendulum.g)
-    root = jnp.stack([orbit.theta2, jnp.log(orbit.period / (PARTS["centred"] * second))])
-    scaled, line = natural(pendulum), Line(orbit.theta1 * origin, direction)
-    rate, _ = rate_along(scaled, line, root[0], root[1], steps_for(root[1], clock(scaled), FINE))
-    steps = steps_for(root[1], rate, FINE).astype(jnp.float64)
-    given, equations = PieceGiven(origin, direction, steps), piece_equations("centred")
-    found = know_piece("centred", root, parameters_of(pendulum, orbit.theta1), given)
-
-    def known(parameters: Array) -> Array:
-        here = Pendulum(*parameters[:5])
-        _, columns = implicit(equations, (root, found), parameters_of(here, parameters[5]), given)
-        of = Known(*columns)
-        log_period = jnp.log(of.time) + 0.5 * jnp.log(here.l1 / here.g)
-        return jnp.stack([of.theta2, log_period, of.kappa, of.log_abs_kappa])
-
-    return jax.jacfwd(known)(jnp.stack([*jax.tree.leaves(pendulum), orbit.theta1]))
 
 
 class Slopes(NamedTuple):

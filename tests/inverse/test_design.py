@@ -14,7 +14,7 @@ from scipy.optimize import brentq, minimize_scalar
 import dpend
 from dpend import Pendulum, Status
 from dpend.inverse.problem import PARAMETERS
-from dpend.orbits.orbit import slopes
+from dpend.orbits.derivatives import slopes
 from dpend.orbits.stability import transition
 
 SIXTY = np.radians(60)
