@@ -100,12 +100,14 @@ def test_a_motion_is_a_row_a_time_and_a_lane(paper):
 
 
 def test_an_atlas_is_its_file(atlas):
-    """The columns of the table are those of the CSV file, with the same numbers."""
+    """The columns of the table are those of the CSV file, with the same numbers; that file is older
+    than certificates.
+    """
     import pandas
 
     written = pandas.read_csv(CATALOGUE, comment="#")
     table = atlas.to_dataframe()
-    assert list(table) == list(written)
+    assert [name for name in table if name != "certificate"] == list(written)
     np.testing.assert_allclose(table.theta2_deg, written.theta2_deg, rtol=1e-15)
     assert table.status.tolist() == written.status.tolist()
     data = atlas.to_xarray()

@@ -101,6 +101,38 @@ class PeriodicOrbit:
         kappas = np.asarray(self.kappa)
         return np.array([stability_class(one) for one in kappas.ravel()]).reshape(kappas.shape)
 
+    def trajectory(
+        self, times: Any | None = None, *, tolerance: float | Any = TOLERANCE
+    ) -> Trajectory:
+        """The motion of a single orbit at `times`, any number of periods on or back.
+
+        It never parts from the orbit, however unstable that is: it starts anew from the states at
+        t = 0 and T/2, and each piece lasts a quarter of the period.
+
+        Arguments:
+            times: [s], shape (n,), in any order; by default 301 over one period, whose last state
+                is the first (up to full turns).
+            tolerance: wanted error of the angles in a quarter of the period [rad], the orbit's
+                states and period taken as they are.
+        Returns:
+            Trajectory of NumPy arrays. Its status is that of the first piece that failed.
+        Raises:
+            ValueError: many orbits, or one that was not found; times not finite; tolerance not
+                positive.
+        """
+        if np.ndim(self.period) or not np.isfinite(period := float(self.period)):
+            raise ValueError(
+                f"orbit must be a single one that was found, got a period of "
+                f"{shown(self.period)}: take one of them"
+            )
+        pendulum, *starts = (
+            jax.tree.map(float, each) for each in (self.pendulum, self.state, self.dual)
+        )
+        # Of a centred orbit `turns` tells of the quarter; it comes back without any.
+        moving = self.symmetry in ("passing", "none")
+        turns = [int(turn) * moving for turn in self.turns]
+        return unfold(pendulum, (starts[0], starts[1]), period, turns, times, tolerance)
+
     def __len__(self) -> int:
         """How many orbits there are along the first axis."""
         if not np.ndim(self.period):
@@ -160,38 +192,6 @@ def orbit_quantities(orbits: PeriodicOrbit) -> Quantities:
     return (
         quantities(flat.state) | quantities(flat, names) | parts | dual | quantities(flat.pendulum)
     )
-
-    def trajectory(
-        self, times: Any | None = None, *, tolerance: float | Any = TOLERANCE
-    ) -> Trajectory:
-        """The motion of a single orbit at `times`, any number of periods on or back.
-
-        It never parts from the orbit, however unstable that is: it starts anew from the states at
-        t = 0 and T/2, and each piece lasts a quarter of the period.
-
-        Arguments:
-            times: [s], shape (n,), in any order; by default 301 over one period, whose last state
-                is the first (up to full turns).
-            tolerance: wanted error of the angles in a quarter of the period [rad], the orbit's
-                states and period taken as they are.
-        Returns:
-            Trajectory of NumPy arrays. Its status is that of the first piece that failed.
-        Raises:
-            ValueError: many orbits, or one that was not found; times not finite; tolerance not
-                positive.
-        """
-        if np.ndim(self.period) or not np.isfinite(period := float(self.period)):
-            raise ValueError(
-                f"orbit must be a single one that was found, got a period of "
-                f"{shown(self.period)}: take one of them"
-            )
-        pendulum, *starts = (
-            jax.tree.map(float, each) for each in (self.pendulum, self.state, self.dual)
-        )
-        # Of a centred orbit `turns` tells of the quarter; it comes back without any.
-        moving = self.symmetry in ("passing", "none")
-        turns = [int(turn) * moving for turn in self.turns]
-        return unfold(pendulum, (starts[0], starts[1]), period, turns, times, tolerance)
 
 
 def mirrored(orbit: PeriodicOrbit, sign: Scalar) -> PeriodicOrbit:
