@@ -64,7 +64,7 @@ def motion_record(motion: Trajectory) -> dict[str, Any]:
         "duration_s": duration,
         **record(motion, "energy_drift error_estimate steps"),
         "method": motion.method,
-        "step_s": abs(duration) / steps,
+        "step_s": abs(duration) / max(1, steps),
         **record(motion, "status tolerance message"),
     }
 

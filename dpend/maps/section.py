@@ -297,7 +297,9 @@ def _write(dataset: Any, path: Path) -> None:
     """Writes a store beside its place, and puts it there whole."""
     draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
-        dataset.to_zarr(draft, mode="w", zarr_format=3, consolidated=False)
+        # Whole arrays: the oldest xarray leaves chunks open, and zarr then refuses them.
+        whole = {name: {"chunks": one.shape} for name, one in dataset.variables.items() if one.ndim}
+        dataset.to_zarr(draft, mode="w", zarr_format=3, consolidated=False, encoding=whole)
         draft.chmod(0o755)
         os.rename(draft, path)
     except BaseException:

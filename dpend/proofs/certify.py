@@ -20,7 +20,6 @@ from dpend.records import parse_decimal
 from dpend.status import Status
 
 if TYPE_CHECKING:
-    from dpend.proofs.digits import Digits
     from dpend.proofs.proof import Problem, Proof
 
 # A proved orbit whose theta2 [rad] or period (relative) is further than this from the one asked
@@ -164,8 +163,8 @@ def answer(question: Question, digits: int | None = None) -> Certificate:
     return replace(found, seconds=time.process_time() - started)
 
 
-def _digits(proof: "Proof", digits: int | None) -> tuple["Digits", Status, str]:
-    """theta2 and the duration of the arc as well as they are proved, and how that went."""
+def _digits(proof: "Proof", digits: int | None) -> tuple[Any, Status, str]:
+    """`Digits` as many as are proved, and how that went."""
     from flint import arb
 
     from dpend.proofs.balls import BITS_OF_PRODUCTS
