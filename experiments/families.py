@@ -82,8 +82,8 @@ def main() -> None:
     fig, axes = plt.subplots(1, 2, figsize=(11.5, 5.4), layout="constrained")
 
     def draw(family: dpend.Family, colour: str, label: str) -> None:
-        plots.family(family, axes[0], plane="angles", colour=colour, label=label)
-        plots.family(family, axes[1], plane="period", colour=colour, label=label)
+        plots.family(family, axes[0], plane="angles", color=colour, label=label)
+        plots.family(family, axes[1], plane="period", color=colour, label=label)
 
     for branch, colour in (("in-phase", plots.UPPER), ("anti-phase", plots.LOWER)):
         family = dpend.follow_family(pendulum, branch, longest_step=0.25 if options.quick else 0.05)

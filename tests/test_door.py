@@ -288,6 +288,7 @@ PAIR = kind(
 ORBITS = kind(
     [None, RELEASE, PAPER, *NO_OBJECTS, [ORBIT], {"A": None}, {"A": RELEASE}], [{"A": ORBIT}]
 )
+PIXELS = kind([*COUNT[0], 63, 4097], [64, np.int64(4096)])
 AXES = kind([*NO_OBJECTS, object()], none=True)
 DRAWN = {
     "pendulum": PENDULUM,
@@ -1105,7 +1106,7 @@ DOORS = {
     "plots.strobe": Door(
         dpend.plots.strobe,
         {"pendulum": PAPER, "motion": SAVED},
-        {**DRAWN, "every": COUNT},
+        {**DRAWN, "every": kind(*COUNT, none=True)},
         "matplotlib.pyplot.subplots",
     ),
     "plots.orbit_sheet": Door(
@@ -1118,9 +1119,23 @@ DOORS = {
             "curve": kind([None, ORBIT, *NO_OBJECTS], [FAMILY]),
             "ax": AXES,
             "plane": kind([None, *NO_CHOICES], ["period"]),
-            "colour": kind([None, 1, "nocolour", b"x", {}, object()], ["red", (0.1, 0.2, 0.3)]),
-            "label": kind([None, 1, b"x", [], object()], ["in phase", ""]),
         },
+        "matplotlib.pyplot.subplots",
+    ),
+    "plots.families": Door(
+        dpend.plots.families,
+        {"curves": {"A": FAMILY}},
+        {
+            "curves": kind([None, FAMILY, *NO_OBJECTS, [FAMILY], {"A": ORBIT}], [{"A": FAMILY}]),
+            "ax": AXES,
+            "plane": kind([None, *NO_CHOICES], ["upright"]),
+        },
+        "matplotlib.pyplot.subplots",
+    ),
+    "plots.atlas": Door(
+        dpend.plots.atlas,
+        {"found": EMPTY},
+        {"found": kind([None, ORBIT, *NO_OBJECTS], [EMPTY]), "ax": AXES},
         "matplotlib.pyplot.subplots",
     ),
     "plots.map_of": Door(
@@ -1155,9 +1170,22 @@ DOORS = {
             "pendulum": PENDULUM,
             "motions": kind([None, SAVED, *NO_OBJECTS, [None], [RELEASE]], [[SAVED]]),
             "out": kind([*PATH[0], "F.txt", "/no/such/place/F.gif"]),
+            "size": PIXELS,
             "progress": PROGRESS,
         },
-        "dpend.animate.replacing",
+        "dpend.animate.joints_of",
+    ),
+    "animate.film_orbit": Door(
+        dpend.animate.film_orbit,
+        {"orbit": ORBIT, "out": str(Path(tempfile.gettempdir()) / "F.gif")},
+        {
+            "orbit": kind([None, RELEASE, *NO_OBJECTS], [ORBIT]),
+            "out": kind([*PATH[0], "F.txt", "/no/such/place/F.gif"]),
+            "speed": POSITIVE,
+            "size": PIXELS,
+            "progress": PROGRESS,
+        },
+        "dpend.animate.joints_of",
     ),
     "animate.check_out": Door(
         dpend.animate.check_out, {}, {"out": kind([*PATH[0], "F.txt", "/no/such/place/F.gif"])}

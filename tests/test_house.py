@@ -37,7 +37,8 @@ proofs.certificate proofs.certify proofs.ledger
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture section_picture plots animate tables report writing reading terminal options
+map_picture section_picture motion_picture film_picture fit_picture family_picture
+plots animate tables report writing reading terminal options
 orbit_commands proof_commands simulation_commands section_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
