@@ -130,7 +130,9 @@ def film(
             a size that is no integer from 64 to 4096.
         RuntimeError: .mp4 without imageio-ffmpeg.
     """
-    out = _check_request(out, size, progress)
+    out = check_request(out, size)
+    if progress is not None:
+        function("progress", progress, "(frames done, frames in all)", "print")
     check_pendulum(pendulum)
     if not isinstance(motions, Sequence):
         raise ValueError(
@@ -172,7 +174,9 @@ def film_orbit(
             than two frames, or more than 10 000.
         RuntimeError: .mp4 without imageio-ffmpeg.
     """
-    out = _check_request(out, size, progress)
+    out = check_request(out, size)
+    if progress is not None:
+        function("progress", progress, "(frames done, frames in all)", "print")
     instance("orbit", orbit, PeriodicOrbit, "what dpend.find_orbit returns")
     single("orbit", orbit.period)
     rate = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
@@ -185,8 +189,8 @@ def film_orbit(
     return _write(Film(motion.time, joints, [], True, int(size)), out, progress)
 
 
-def _check_request(out: Any, size: Any, progress: Any) -> Path:
-    """The path of a film, once it is known that it can be written."""
+def check_request(out: Any, size: Any = PIXELS) -> Path:
+    """The path of a film, once it is known that it can be written; raises as `film` does."""
     out = file_path("out", out)
     check_out(out)
     if not _LEAST_PIXELS <= integer("size", size) <= _MOST_PIXELS:
@@ -194,8 +198,6 @@ def _check_request(out: Any, size: Any, progress: Any) -> Path:
             f"size must be from {_LEAST_PIXELS} to {_MOST_PIXELS} pixels, got {size}: give "
             f"another one"
         )
-    if progress is not None:
-        function("progress", progress, "(frames done, frames in all)", "print")
     return out
 
 

@@ -38,8 +38,8 @@ inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse
 inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
 map_picture section_picture motion_picture film_picture fit_picture family_picture
-plots animate tables report writing reading terminal options
-orbit_commands proof_commands simulation_commands section_commands cli
+plots animate tables report terminal writing reading options
+orbit_commands design_commands proof_commands simulation_commands section_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
@@ -49,7 +49,7 @@ LAZY = {("dpend", "plots"), ("dpend", "animate")}
 LONGEST_FILE, LONGEST_FUNCTION, MOST_BRANCHES = 350, 40, 12
 LONG_FILES = {"orbits/find.py", "orbits/special.py"}
 LONG_FUNCTIONS = {
-    "map_command", "atlas", "orbit", "simulate", "fit", "certify",  # options, one a line
+    "map_command", "atlas", "orbit", "family", "simulate", "fit", "certify",  # options, one a line
     "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation
     "find_orbit", "check_gradient", "_dopri8",
 }  # fmt: skip
