@@ -35,12 +35,13 @@ from dpend.options import (
     radians,
 )
 from dpend.orbits.arc import SYMMETRIES
+from dpend.orbits.family_files import family_record, file_record
 from dpend.orbits.files import orbit_record, orbits_record
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import BRANCHES, FAMILIES
 from dpend.places import check_place, replacing
 from dpend.reading import read_orbit
-from dpend.report import converged, family_record, print_atlas, print_family, print_orbits
+from dpend.report import converged, print_atlas, print_family, print_orbits
 from dpend.status import Status
 from dpend.terminal import clock, tell_cost, work
 from dpend.writing import (
@@ -132,9 +133,8 @@ def orbit(
     ]
     record = orbits_record(records, both)
     _write(record, out, formats)
-    draw_orbits(found, figure)
-    film_orbit(next(iter(found.values())), film)
-    show = partial(print_orbits, pendulum, records, out, figure, film)
+    drawn = draw_orbits(found, figure), film_orbit(next(iter(found.values())), film)
+    show = partial(print_orbits, pendulum, records, out, *drawn)
     return record, show, converged(*found.values())
 
 
@@ -226,7 +226,7 @@ def family(
         if special is not None:
             found = _branch_of(pendulum, found, special)
     record = family_record(found, branch)
-    _write(record, out, formats)
+    _write(file_record(found, branch), out, formats)
     draw_family(found, figure)
     return record, partial(print_family, record, out, figure), converged(found)
 

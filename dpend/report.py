@@ -14,7 +14,7 @@ from dpend.mechanics.pendulum import Pendulum
 from dpend.motion.trajectory import Trajectory
 from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.files import orbit_record
-from dpend.records import columns, json_text, record
+from dpend.records import json_text, record
 from dpend.status import Status
 from dpend.tables import print_table
 
@@ -28,32 +28,6 @@ _SLOPES = {
 }
 # The same as columns of the table, with their headings.
 _SLOPE_HEADINGS = {"period_s": "period (s)", "kappa": "kappa", "theta2_deg": "theta2 (deg)"}
-
-
-def family_record(family: dpend.Family, branch: str | None) -> dict[str, Any]:
-    """Momenta only where they are not zero."""
-    rests = family.symmetry in RELEASED_SYMMETRIES
-    table = columns(family, "arclength")
-    table |= columns(family.orbits.state, "theta1 theta2")
-    table |= columns(family.orbits, "period energy kappa log_abs_kappa error_estimate")
-    table |= {} if rests else columns(family.orbits.state, "p1 p2")
-    points = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
-    return {
-        "branch": branch,
-        "symmetry": family.symmetry,
-        "points": [point | {"symmetry": family.symmetry} for point in points],
-        "bifurcations": [
-            {
-                **record(point, "kind arclength"),
-                **record(point.orbit.state, "theta1 theta2"),
-                **record(point.orbit, "period energy kappa"),
-                **({} if rests else record(point.orbit.state, "p1 p2")),
-            }
-            for point in family.special_points
-        ],
-        **record(family, "ends status message"),
-        "pendulum": record(jax.tree.map(lambda leaf: leaf[0], family.orbits.pendulum)),
-    }
 
 
 def motion_record(motion: Trajectory) -> dict[str, Any]:

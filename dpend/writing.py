@@ -74,17 +74,19 @@ def check_film(path: Path | None, both: bool) -> None:
     animate.check_out(path)
 
 
-def film_orbit(orbit: dpend.PeriodicOrbit, path: Path | None) -> None:
-    """One period of an orbit that was found."""
+def film_orbit(orbit: dpend.PeriodicOrbit, path: Path | None) -> Path | None:
+    """One period of an orbit, if it was found; the path, if it was written."""
     from dpend import animate
 
-    if path is not None and orbit.status == Status.CONVERGED:
-        with bar(on_terminal(), "frames") as show:
-            animate.film_orbit(orbit, path, progress=show)
+    if path is None or orbit.status != Status.CONVERGED:
+        return None
+    with bar(on_terminal(), "frames") as show:
+        animate.film_orbit(orbit, path, progress=show)
+    return path
 
 
-def draw_orbits(orbits: dict[Any, dpend.PeriodicOrbit], path: Path | None) -> None:
-    """Those of the orbits that were found, a row each."""
+def draw_orbits(orbits: dict[Any, dpend.PeriodicOrbit], path: Path | None) -> Path | None:
+    """Those of the orbits that were found, a row each; the path, if there are any."""
     from dpend import plots
 
     found = {
@@ -92,8 +94,10 @@ def draw_orbits(orbits: dict[Any, dpend.PeriodicOrbit], path: Path | None) -> No
         for name, orbit in orbits.items()
         if orbit.status == Status.CONVERGED
     }
-    if path is not None and found:
-        _save_figure(lambda: plots.orbit_sheet(found), path, dpi=150)
+    if path is None or not found:
+        return None
+    _save_figure(lambda: plots.orbit_sheet(found), path, dpi=150)
+    return path
 
 
 def draw_family(family: dpend.Family, path: Path | None) -> None:

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from typer.main import get_command
 
+import dpend
 import dpend.catalogue.release
 import dpend.catalogue.scan
 from dpend import cli, report, terminal, writing
@@ -541,7 +542,9 @@ def test_a_family_as_json_and_csv(capsys, tmp_path):
         table["theta2_deg"], [point["theta2_deg"] for point in found["points"]], rtol=1e-15
     )
     run(capsys, "family", "--branch", "anti-phase", "--out", tmp_path / "f.json")
-    assert json.loads((tmp_path / "f.json").read_text()) == found
+    written = json.loads((tmp_path / "f.json").read_text())
+    assert {key: written[key] for key in found} == found
+    assert dpend.load_family(tmp_path / "f.json").ends == ("normal mode", "homoclinic")
     for bad in (
         ("--branch", "sideways"),
         ("--branch", "in-phase", "--out", "f.txt"),

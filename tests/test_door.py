@@ -840,6 +840,18 @@ DOORS = {
     "load_orbits": Door(
         dpend.load_orbits, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}
     ),
+    "load_family": Door(
+        dpend.load_family, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}
+    ),
+    "save_family": Door(
+        dpend.save_family,
+        {"family": FAMILY, "path": str(Path(tempfile.gettempdir()) / "F.json")},
+        {
+            "family": kind([None, ORBIT, *NO_OBJECTS]),
+            "path": kind([*PATH[0], "F.txt", "/no/such/place/F.json"]),
+        },
+        "dpend.orbits.family_files.replacing",
+    ),
     "save_orbits": Door(
         dpend.save_orbits,
         {"orbits": ORBIT, "path": "F.json"},
