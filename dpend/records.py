@@ -30,9 +30,10 @@ _SUFFIXES = {
     "J": "_J",
 }
 
-# How files tell what the numbers of a status mean (the CF conventions, section 3.5).
+# How files tell what the numbers of a status mean (the CF conventions, section 3.5): numbers up to
+# 255, in a type that NetCDF 3 has, too.
 _FLAGS = {
-    "flag_values": np.array(list(Status), np.uint8),
+    "flag_values": np.array(list(Status), np.int16),
     "flag_meanings": " ".join(one.name.lower() for one in Status),
 }
 
@@ -138,7 +139,7 @@ def variables(
     for name, (value, unit) in table.items():
         data[name] = (dim, value, {"units": unit} if unit else {})
         if name == "status":
-            data[name] = (dim, value.astype(np.uint8), _FLAGS)
+            data[name] = (dim, value.astype(np.int16), _FLAGS)
     degrees = {
         f"{name}_deg": (dim, np.degrees(value), {"units": "degree"})
         for name, (value, unit) in table.items()

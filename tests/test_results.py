@@ -34,6 +34,18 @@ def atlas():
     return dpend.load_atlas(CATALOGUE)
 
 
+def test_a_batch_of_motions_comes_back_from_netcdf(paper, tmp_path):
+    """A status goes up to 255, which no type of NetCDF 3 for one byte holds."""
+    import xarray
+
+    batch = dpend.released(np.array([0.1, 0.2]), np.array([0.2, 0.3]))
+    data = dpend.simulate(paper, batch, times=[0.0, 0.1], tolerance=1e-9).to_xarray()
+    data.to_netcdf(tmp_path / "m.nc", engine="scipy")
+    with xarray.open_dataset(tmp_path / "m.nc", engine="scipy") as back:
+        np.testing.assert_array_equal(back.theta1, data.theta1)
+        assert back.status.attrs["flag_values"].max() == dpend.Status.NOT_COMPUTED == 255
+
+
 def test_an_array_of_orbits_is_one(orbits):
     assert len(orbits) == 3
     each = [*orbits]

@@ -4,9 +4,9 @@ The file is one object. `format` is 1 and `dpend_version` tells who wrote it. `p
 its orbits and `bifurcations` of its special points, for people and other programs: angles in
 degrees, everything else in SI units, as the names say. `curve` is what the family is read from, in
 natural units (l1, m1 and sqrt(l1/g) are one): `turns`, which close the arcs; for each orbit
-`nodes`, the states at the cuts of its arc one after another, then the logarithm of the time scale
-and the share of the turn that `dpend.orbits.arc` names, and `steps`, how many a segment is given;
-`mode` is the same of the normal mode that the family begins in, with its tangent, or null.
+`nodes`, its 66 unknowns: the states at the cuts of its arc one after another, log Delta and the
+unfolding parameter, see `dpend.orbits.arc`; and `steps`, how many a segment is given; `mode` is the
+same of the normal mode that the family begins in, with its tangent, or null.
 """
 
 import os
