@@ -30,6 +30,8 @@ _SUFFIXES = {
     "J": "_J",
 }
 
+# Rows of a table in a notebook.
+_SHOWN_ROWS = 10
 # How files tell what the numbers of a status mean (the CF conventions, section 3.5): numbers up to
 # 255, in a type that NetCDF 3 has, too.
 _FLAGS = {
@@ -174,6 +176,19 @@ def outcome(status: Any) -> str:
     if np.ndim(status) == 0:
         return names[0]
     return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True))
+
+
+def html(result: Any) -> str:
+    """A result as a notebook shows it: its `repr`, and the first and last rows of its table; of
+    what is traced the former alone.
+    """
+    from html import escape
+
+    told = f"<p><code>{escape(repr(result))}</code></p>"
+    try:
+        return told + str(result.to_dataframe().to_html(max_rows=_SHOWN_ROWS, border=0))
+    except TypeError:  # of JAX, where a number is none yet
+        return told
 
 
 def parse_json(text: str) -> Any:
