@@ -65,6 +65,8 @@ from dpend.motion.simulate import simulate as simulate
 from dpend.motion.trajectory import Trajectory as Trajectory
 from dpend.orbits.continuation import follow_family as follow_family
 from dpend.orbits.family import Family as Family
+from dpend.orbits.family_files import load_family as load_family
+from dpend.orbits.family_files import save_family as save_family
 from dpend.orbits.files import load_orbits as load_orbits
 from dpend.orbits.files import save_orbits as save_orbits
 from dpend.orbits.find import find_orbit as find_orbit

@@ -2,18 +2,19 @@
 stroboscope sees it.
 
 Several releases are drawn into one picture, each in a colour of its own, so that one sees when they
-part.
+part. The film of an orbit lasts a period, and its end runs into its beginning without a seam.
 """
 
 import math
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
-from dpend.checks import function, instance, known_number, shown
+from dpend.checks import function, instance, integer, known_number, shown, single
+from dpend.film_picture import FRAMES_PER_SECOND, SAVED, WRITERS, Film, Progress, find_encoder
 from dpend.mechanics.linear import fast_frequency
 from dpend.mechanics.pendulum import (
     Pendulum,
@@ -21,34 +22,18 @@ from dpend.mechanics.pendulum import (
     check_motion,
     check_pendulum,
     check_state,
-    positions,
 )
 from dpend.motion.simulate import simulate
 from dpend.motion.trajectory import Trajectory
+from dpend.motion_picture import joints_of
+from dpend.orbits.orbit import PeriodicOrbit
 from dpend.places import check_place, file_path, replacing
-from dpend.plots import LOWER, UPPER
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# Called after each frame with how many are drawn, and of how many.
-Progress: TypeAlias = Callable[[int, int], None]
-
-# Okabe and Ito's palette, told apart by the colour-blind; its yellow is too pale for a line on
-# white.
-COLOURS = (UPPER, LOWER, "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-# GIFs tell time in hundredths of a second, and 25 a second is the fastest rate in whole ones that
-# players keep.
-FRAMES_PER_SECOND = 25
 # The fast mode advances by this in a step [rad]. Order 8 is then right far below a pixel, for as
 # long as the motion can be known at all, and all releases share one compiled program.
 _TURN = 0.05
-# Saved times in a frame: the trail is then a curve, not a polygon.
-_SAVED = 4
-# How much of the lower bob's way trails behind it [s].
-_TRAIL = 0.6
-# Pixels along a side: a multiple of 16, as video codecs want it.
-_PIXELS = 480
+# Pixels of the longer side of what is seen.
+PIXELS, _LEAST_PIXELS, _MOST_PIXELS = 480, 64, 4096
 # Beyond this a GIF is hundreds of megabytes, and no one waits for it.
 _MOST_FRAMES = 10_000
 # Half a minute of computing for each release; only a few of its states are saved.
@@ -84,15 +69,15 @@ def motions_for(
     interval = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
     duration = known_number("duration", duration, positive=True, unit="s")
     frames = _count_frames(duration, interval, speed)
-    substeps = interval * float(fast_frequency(pendulum)) / (_TURN * _SAVED)
-    steps = frames * _SAVED * (substeps + 1)
+    substeps = interval * float(fast_frequency(pendulum)) / (_TURN * SAVED)
+    steps = frames * SAVED * (substeps + 1)
     if not steps <= _MOST_STEPS:
         raise ValueError(
             f"duration must take at most {_MOST_STEPS:.0e} steps with this pendulum, got "
             f"{duration:g} s, which takes {steps:.3g}: give a shorter one, or another pendulum"
         )
     every = max(1, math.ceil(substeps))
-    step = interval / (_SAVED * every)
+    step = interval / (SAVED * every)
     end, most = frames * interval, 2 * _MOST_STEPS
     return [
         simulate(pendulum, one, end, step=step, save_every=every, most_steps=most)
@@ -116,26 +101,38 @@ def _count_frames(duration: float, interval: float, speed: float) -> int:
     return math.ceil(count - 1e-9)
 
 
+def _count_loop(period: float, interval: float, speed: float) -> int:
+    """The frames of a loop: two at least, the number nearest to `speed`."""
+    _count_frames(period, 2 * interval, speed)
+    return round(period / interval)
+
+
 def film(
     pendulum: Pendulum | Any,
     motions: Sequence[Trajectory] | Any,
-    out: Path | Any,
+    out: str | os.PathLike[str] | Any,
     *,
+    size: int | Any = PIXELS,
     progress: Progress | Any | None = None,
 ) -> int:
     """Draws motions with common, equally spaced times into `out`; returns the number of frames.
 
-    A .gif or .mp4 shows every fourth saved time, 25 in a second; a .png all of these at once,
-    fading into the past.
+    A .gif or .mp4 shows every fourth saved time, 25 in a second, and as much of the plane as the
+    motions need; a .png some fifteen of these at once over the path of the lower bob, fading into
+    the past. Several motions have a legend with the angles that they begin with.
 
     Arguments:
+        out: text or a path.
+        size: pixels along the longer side, without the line for the clock.
         progress: called after each frame with how many are drawn, and of how many.
     Raises:
-        ValueError: another suffix, no such directory, no motions, or motions with different times.
+        ValueError: another suffix, no such directory, no motions, or motions with different times;
+            a size that is no integer from 64 to 4096.
         RuntimeError: .mp4 without imageio-ffmpeg.
     """
-    out = file_path("out", out)
-    check_out(out)
+    out = check_request(out, size)
+    if progress is not None:
+        function("progress", progress, "(frames done, frames in all)", "print")
     check_pendulum(pendulum)
     if not isinstance(motions, Sequence):
         raise ValueError(
@@ -143,139 +140,75 @@ def film(
         )
     for motion in motions:
         instance("motions", motion, Trajectory, "a list of them, see motions_for")
-    if progress is not None:
-        function("progress", progress, "(frames done, frames in all)", "print")
     if not motions or not all(np.array_equal(motion.time, motions[0].time) for motion in motions):
         raise ValueError(
             f"motions must be at least one, saved at the same times, got {len(motions)}: see "
             f"motions_for"
         )
-    with replacing(out) as draft:
-        return _WRITERS[out.suffix](
-            pendulum, motions, draft, progress or (lambda done, total: None)
+    joints = [joints_of(pendulum, motion.state) for motion in motions]
+    starts = [np.degrees([motion.state.theta1[0], motion.state.theta2[0]]) for motion in motions]
+    names = [f"({one:.5g}, {two:.5g})°" for one, two in starts] if len(motions) > 1 else []
+    return _write(Film(np.asarray(motions[0].time), joints, names, False, int(size)), out, progress)
+
+
+def film_orbit(
+    orbit: PeriodicOrbit | Any,
+    out: str | os.PathLike[str] | Any,
+    *,
+    speed: float | Any = 1.0,
+    size: int | Any = PIXELS,
+    progress: Progress | Any | None = None,
+) -> int:
+    """Draws one period of an orbit into `out`; returns the number of frames.
+
+    Shown in a loop, the film has no seam: the last frame is followed by the first at the distance
+    of all others, in time and in the plane, and what trails behind the bob goes on, too. To that
+    end the frames are evenly spaced over the period, and `speed` is kept to the nearest frame.
+
+    Arguments:
+        orbit: a single one that was found.
+        out, size, progress: see `film`.
+        speed: seconds of the motion in a second of the film.
+    Raises:
+        ValueError: as `film`; many orbits, or one that was not found; a speed that leaves fewer
+            than two frames, or more than 10 000.
+        RuntimeError: .mp4 without imageio-ffmpeg.
+    """
+    out = check_request(out, size)
+    if progress is not None:
+        function("progress", progress, "(frames done, frames in all)", "print")
+    instance("orbit", orbit, PeriodicOrbit, "what dpend.find_orbit returns")
+    single("orbit", orbit.period)
+    rate = known_number("speed", speed, positive=True) / FRAMES_PER_SECOND
+    period = float(orbit.period)
+    if not math.isfinite(period):
+        raise ValueError(f"orbit must be one that was found, got a period of {period}: see status")
+    count = _count_loop(period, rate, speed)
+    motion = orbit.trajectory(np.arange(SAVED * count) * (period / (SAVED * count)))
+    joints = [joints_of(orbit.pendulum, motion.state)]
+    return _write(Film(motion.time, joints, [], True, int(size)), out, progress)
+
+
+def check_request(out: Any, size: Any = PIXELS) -> Path:
+    """The path of a film, once it is known that it can be written; raises as `film` does."""
+    out = file_path("out", out)
+    check_out(out)
+    if not _LEAST_PIXELS <= integer("size", size) <= _MOST_PIXELS:
+        raise ValueError(
+            f"size must be from {_LEAST_PIXELS} to {_MOST_PIXELS} pixels, got {size}: give "
+            f"another one"
         )
+    return out
 
 
-def check_out(out: Path | Any) -> None:
+def _write(film: Film, out: Path, progress: Progress | None) -> int:
+    with replacing(out) as draft:
+        return WRITERS[out.suffix](film, draft, progress or (lambda done, total: None))
+
+
+def check_out(out: str | os.PathLike[str] | Any) -> None:
     """Refuses, before anything is computed, what `film` could not write; raises as it does."""
     out = file_path("out", out)
-    check_place("out", out, tuple(_WRITERS))
+    check_place("out", out, tuple(WRITERS))
     if out.suffix == ".mp4":
-        _encoder()
-
-
-def _encoder() -> Any:
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise RuntimeError(
-            "MP4 needs the encoder of imageio-ffmpeg: pip install 'dpend[video]', or write a .gif"
-        ) from None
-    return imageio_ffmpeg
-
-
-def _joints(pendulum: Pendulum, motion: Trajectory) -> np.ndarray:
-    """Pivot and both bobs [m], shape (times, 3, 2)."""
-    x1, y1, x2, y2 = (np.asarray(leaf) for leaf in positions(pendulum, motion.state))
-    still = np.zeros_like(x1)
-    return np.stack([np.stack([still, x1, x2], 1), np.stack([still, y1, y2], 1)], 2)
-
-
-def _count(motions: Sequence[Trajectory]) -> int:
-    """Frames of a film."""
-    return (motions[0].time.size - 1) // _SAVED + 1
-
-
-def _canvas(pendulum: Pendulum) -> "tuple[Figure, Any]":
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(_PIXELS / 100, _PIXELS / 100), dpi=100)
-    FigureCanvasAgg(figure)
-    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    reach = 1.1 * float(pendulum.l1 + pendulum.l2)
-    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-    ax.axis("off")
-    ax.plot(0, 0, "s", color="black", markersize=4)
-    return figure, ax
-
-
-def _frames(pendulum: Pendulum, motions: Sequence[Trajectory]) -> Iterator[np.ndarray]:
-    """Pictures of one saved time after another, RGB bytes of shape (480, 480, 3)."""
-    figure, ax = _canvas(pendulum)
-    canvas: Any = figure.canvas
-    joints = [_joints(pendulum, motion) for motion in motions]
-    times = np.asarray(motions[0].time)
-    tail = math.ceil(_TRAIL / abs(times[1] - times[0]))
-    artists = []
-    for index in range(len(motions)):
-        colour = COLOURS[index % len(COLOURS)]
-        (trail,) = ax.plot([], [], color=colour, alpha=0.35, linewidth=1.5)
-        (rods,) = ax.plot([], [], "o-", color=colour, linewidth=2, markersize=8)
-        artists.append((trail, rods))
-    clock = ax.text(0.03, 0.95, "", transform=ax.transAxes, fontsize=11)
-    for i in range(0, times.size, _SAVED):
-        for (trail, rods), where in zip(artists, joints, strict=True):
-            trail.set_data(*where[max(0, i - tail) : i + 1, 2].T)
-            rods.set_data(*where[i].T)
-        clock.set_text(f"{times[i]:.2f} s")
-        canvas.draw()
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _write_gif(
-    pendulum: Pendulum, motions: Sequence[Trajectory], path: Path, progress: Progress
-) -> int:
-    from PIL import Image
-
-    total = _count(motions)
-
-    def pictures() -> Iterator[Any]:
-        for done, frame in enumerate(_frames(pendulum, motions), 1):
-            yield Image.fromarray(frame).quantize(64, dither=Image.Dither.NONE)
-            progress(done, total)
-
-    frames = pictures()
-    with path.open("wb") as file:
-        timing = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0}
-        next(frames).save(file, format="GIF", save_all=True, append_images=frames, **timing)
-    return total
-
-
-def _write_mp4(
-    pendulum: Pendulum, motions: Sequence[Trajectory], path: Path, progress: Progress
-) -> int:
-    total = _count(motions)
-    writer = _encoder().write_frames(
-        str(path), (_PIXELS, _PIXELS), fps=FRAMES_PER_SECOND, macro_block_size=16
-    )
-    with warnings.catch_warnings():
-        # The encoder is started by a fork that becomes another program at once: no thread of JAX is
-        # missed.
-        warnings.filterwarnings(
-            "ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning
-        )
-        writer.send(None)
-    for done, frame in enumerate(_frames(pendulum, motions), 1):
-        writer.send(np.ascontiguousarray(frame))
-        progress(done, total)
-    writer.close()
-    return total
-
-
-def _write_png(
-    pendulum: Pendulum, motions: Sequence[Trajectory], path: Path, progress: Progress
-) -> int:
-    figure, ax = _canvas(pendulum)
-    total = _count(motions)
-    for index, motion in enumerate(motions):
-        colour = COLOURS[index % len(COLOURS)]
-        for i, where in enumerate(_joints(pendulum, motion)[::_SAVED]):
-            fade = 0.1 + 0.9 * ((i + 1) / total) ** 2
-            ax.plot(*where.T, "o-", color=colour, alpha=fade, linewidth=1, markersize=4)
-            progress(i + 1, total)
-    figure.savefig(path, dpi=200)
-    return total
-
-
-_WRITERS = {".gif": _write_gif, ".mp4": _write_mp4, ".png": _write_png}
+        find_encoder()

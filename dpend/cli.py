@@ -16,14 +16,20 @@ import jax
 import numpy as np
 import typer
 
-from dpend import orbit_commands, proof_commands, section_commands, simulation_commands
+from dpend import (
+    design_commands,
+    orbit_commands,
+    proof_commands,
+    section_commands,
+    simulation_commands,
+)
 from dpend._runtime import catch_interrupts, leave_quietly, take_all_cores
 from dpend.executables import keep_executables
 from dpend.options import app
 from dpend.terminal import tell_error
 
 # The files of the commands, which put them into `app` as they are imported, in the order of --help.
-COMMANDS = (orbit_commands, proof_commands, simulation_commands, section_commands)
+COMMANDS = (orbit_commands, design_commands, proof_commands, simulation_commands, section_commands)
 
 
 def _keep_compiled_code() -> None:

@@ -1,5 +1,7 @@
 """A map in colours: its scale, its axes, and the line inside which nothing can flip."""
 
+import contextlib
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +23,7 @@ _QUANTILES = (0.005, 0.995)
 _MOST_CELLS = 1500
 
 
-def draw_map(ax: "Axes", dataset: Any, name: str) -> None:
+def draw_map(ax: "Axes", dataset: Any, name: str, style: dict[str, Any]) -> None:
     """Draws the value `name` of a two-dimensional sweep, see `plots.map_of`."""
     field = dataset[name]
     every = -(-max(field.shape) // _MOST_CELLS)
@@ -29,17 +31,33 @@ def draw_map(ax: "Axes", dataset: Any, name: str) -> None:
     across, up = dataset[name].dims
     x, y = (_values_of(dataset, key) for key in (across, up))
     values, label, norm = _colours_of(dataset[name], name)
-    mesh = ax.pcolormesh(
-        x, y, values, norm=norm, cmap="viridis", shading="nearest", rasterized=True
-    )
+    if "norm" not in style:
+        norm.vmin, norm.vmax = style.pop("vmin", norm.vmin), style.pop("vmax", norm.vmax)
+    look = {"norm": norm, "cmap": "viridis", "shading": "nearest", "rasterized": True} | style
+    mesh = ax.pcolormesh(x, y, values, **look)
     assert ax.figure is not None
-    ax.figure.colorbar(mesh, ax=ax, label=label, extend="both")
+    # In axes that hang on the map's own: as high as the map, whatever its shape.
+    beside = ax.inset_axes((1.03, 0.0, 0.045, 1.0))
+    ax.figure.colorbar(mesh, cax=beside, label=label, extend="both", extendfrac=0.03)
+    ax.set_title(_title_of(dataset), fontsize="small", loc="left")
     _label_axis(ax.xaxis, dataset, across)
     _label_axis(ax.yaxis, dataset, up)
     if {across, up} == {"theta1", "theta2"}:
         if name == "flip_time":
             _draw_flip_bound(dataset, ax, across)
         ax.set_aspect("equal")
+
+
+def _title_of(dataset: Any) -> str:
+    """The duration, if the quantity has one, and the pendulum."""
+    at = dataset.attrs
+    told = []
+    # A quantity need have no duration, and a dataset made by hand no settings.
+    with contextlib.suppress(KeyError, IndexError, TypeError, ValueError):
+        told.append(f"{json.loads(at['quantity_settings'])[1]['duration']:g} s")
+    units = {"l1": "m", "l2": "m", "m1": "kg", "m2": "kg", "g": "m/s$^2$"}
+    told += [f"{key} = {at[key]:g} {unit}" for key, unit in units.items() if key in at]
+    return ", ".join(told)
 
 
 def _colours_of(field: Any, name: str) -> tuple[np.ndarray, str, Any]:

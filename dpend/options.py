@@ -12,7 +12,7 @@ import typer
 
 from dpend._version import __version__
 from dpend.checks import number
-from dpend.mechanics.pendulum import Pendulum
+from dpend.mechanics.pendulum import Pendulum, State, momenta
 from dpend.orbits.orbit import BRANCHES, PeriodicOrbit
 from dpend.records import parse_decimal
 from dpend.report import print_json
@@ -127,6 +127,13 @@ _PENDULUM = {
     "g": (9.8, "Acceleration of gravity [m/s^2]."),
 }
 Theta1 = Annotated[float, numeric("--theta1", help="Release angle of the upper rod [deg].")]
+Omega1 = Annotated[
+    float | None,
+    numeric("--omega1", help="In the place of momenta: angular velocity of the upper rod [deg/s]."),
+]
+Omega2 = Annotated[
+    float | None, numeric("--omega2", help="Of the lower rod [deg/s], with --omega1.")
+]
 _JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 # What a command hands back: its record for --json, how to print it for people, and whether all its
@@ -169,6 +176,31 @@ def command(name: str | None = None) -> Callable[[Callable[..., Report]], Callab
 
 def radians(name: str, degrees: float) -> float:
     return math.radians(number(name, degrees, unit="deg"))
+
+
+def moving_state(
+    pendulum: Pendulum,
+    angles: tuple[float, float],
+    of_momenta: tuple[float | None, float | None],
+    rates: tuple[float | None, float | None],
+) -> State:
+    """The state with angles [rad] and momenta [kg m^2/s] or angular velocities [deg/s]; what is not
+    given is zero.
+    """
+    names = ("p1", "p2", "omega1", "omega2")
+    given = {
+        name: value
+        for name, value in zip(names, (*of_momenta, *rates), strict=True)
+        if value is not None
+    }
+    if rates == (None, None):
+        p1, p2 = (number(name, given.get(name, 0.0)) for name in names[:2])
+        return State(*angles, p1, p2)
+    if of_momenta != (None, None):
+        raise ValueError(
+            f"omega1 and omega2 exclude p1 and p2, got {' and '.join(given)}: give either"
+        )
+    return momenta(pendulum, *angles, *(radians(name, given.get(name, 0.0)) for name in names[2:]))
 
 
 def guess_in(theta2: float | None, period: float | None) -> tuple[float, float] | None:

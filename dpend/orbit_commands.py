@@ -1,4 +1,4 @@
-"""The commands about orbits: `orbit`, `family`, `atlas` and `design`.
+"""The commands about orbits: `orbit`, `family` and `atlas`.
 
 A command takes the pendulum that `options.command` makes of the shared options, and a parameter for
 each option of its own: these may be more than seven. It hands back a report, which is printed.
@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-import jax
 import numpy as np
 import typer
 
@@ -21,37 +20,40 @@ from dpend.catalogue.release import (
     check_period,
     foresee_steps,
 )
-from dpend.checks import at_most_one, number, one_of
-from dpend.mechanics.pendulum import Pendulum, State
+from dpend.checks import at_most_one, one_of
+from dpend.mechanics.pendulum import Pendulum
 from dpend.options import (
+    Omega1,
+    Omega2,
     Report,
     Theta1,
-    bounds_in,
     command,
     counted,
-    equations_of,
     guess_in,
-    names_in,
+    moving_state,
     numeric,
     radians,
 )
+from dpend.orbits.arc import SYMMETRIES
+from dpend.orbits.family_files import family_record, file_record
 from dpend.orbits.files import orbit_record, orbits_record
 from dpend.orbits.find import swinging_pendulum
-from dpend.orbits.orbit import BRANCHES, FAMILIES, PeriodicOrbit
+from dpend.orbits.orbit import BRANCHES, FAMILIES
 from dpend.places import check_place, replacing
 from dpend.reading import read_orbit
-from dpend.report import (
-    converged,
-    design_record,
-    family_record,
-    print_atlas,
-    print_design,
-    print_family,
-    print_orbits,
-)
+from dpend.report import converged, print_atlas, print_family, print_orbits
 from dpend.status import Status
 from dpend.terminal import clock, tell_cost, work
-from dpend.writing import write_family_csv, write_json
+from dpend.writing import (
+    check_figure,
+    check_film,
+    draw_atlas,
+    draw_family,
+    draw_orbits,
+    film_orbit,
+    write_family_csv,
+    write_json,
+)
 
 
 @command()
@@ -75,11 +77,13 @@ def orbit(
         ),
     ] = None,
     p2: Annotated[float | None, numeric("--p2", help="Of the lower angle, with --p1.")] = None,
+    omega1: Omega1 = None,
+    omega2: Omega2 = None,
     symmetry: Annotated[
         str | None,
         typer.Option(
-            help="centred or brake, with a guess, also passing, odd or none with momenta; found "
-            "out if not given."
+            metavar="|".join(SYMMETRIES),
+            help="centred or brake with a guess, any with momenta; found out if not given.",
         ),
     ] = None,
     ratio: Annotated[
@@ -93,19 +97,27 @@ def orbit(
     out: Annotated[
         Path | None, typer.Option(help="Write to F.json what --json prints, for dpend family.")
     ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw rods, path and angles into P.png, P.pdf or P.svg.")
+    ] = None,
+    film: Annotated[
+        Path | None, typer.Option(help="One period as F.gif or F.mp4, which loops without a seam.")
+    ] = None,
 ) -> Report:
     """The releases from rest at THETA1 that come back: partner angle, period, stability, error; or
     the orbit near any motion.
     """
     formats = _formats(out, {".json": write_json})
+    check_figure(figure)
     guess, release = guess_in(theta2, period), radians("theta1", theta1)
     if crossing is not None and branch is None:
         raise ValueError(
             f"crossing must go with branch, got {crossing} alone: give --branch "
             f"{' or '.join(BRANCHES)}"
         )
-    near = _near(release, guess, p1, p2)
+    near = _near(pendulum, release, guess, (p1, p2), (omega1, omega2))
     both = branch is None and ratio is None and near == {"theta1": release}
+    check_film(film, both)
     find = partial(
         dpend.find_orbit,
         pendulum,
@@ -121,22 +133,35 @@ def orbit(
     ]
     record = orbits_record(records, both)
     _write(record, out, formats)
-    return record, partial(print_orbits, pendulum, records, out), converged(*found.values())
+    drawn = draw_orbits(found, figure), film_orbit(next(iter(found.values())), film)
+    show = partial(print_orbits, pendulum, records, out, *drawn)
+    return record, show, converged(*found.values())
 
 
 def _near(
-    theta1: float, guess: tuple[float, float] | None, p1: float | None, p2: float | None
+    pendulum: Pendulum,
+    theta1: float,
+    guess: tuple[float, float] | None,
+    momenta: tuple[float | None, float | None],
+    rates: tuple[float | None, float | None],
 ) -> dict[str, Any]:
-    """What `find_orbit` starts from: a release, a guess of one, or a motion with momenta."""
-    if p1 is None and p2 is None:
+    """What `find_orbit` starts from: a release, a guess of one, or a motion with momenta or angular
+    velocities.
+    """
+    if momenta == rates == (None, None):
         return {"theta1": theta1} | ({} if guess is None else {"guess": guess})
-    if guess is None or p1 is None or p2 is None:
-        missing = "p1" if p1 is None else "p2" if p2 is None else "theta2"
+    names, given = ("p1", "p2"), momenta
+    if momenta == (None, None):
+        names, given = ("omega1", "omega2"), rates
+    if guess is None or None in given:
+        missing = names[given.index(None)] if None in given else "theta2"
+        of = "a momentum" if names[0] == "p1" else "an angular velocity"
         raise ValueError(
-            f"{missing} must be given with a momentum, got none: a motion is theta1, theta2, p1, "
-            f"p2 and period"
+            f"{missing} must be given with {of}, got none: a motion is theta1, theta2, "
+            f"{', '.join(names)} and period"
         )
-    return {"state": State(theta1, guess[0], p1, p2), "period": guess[1]}
+    state = moving_state(pendulum, (theta1, guess[0]), momenta, rates)
+    return {"state": state, "period": guess[1]}
 
 
 # How a record is written, by the suffix of its file.
@@ -177,7 +202,14 @@ def family(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Write all points to F.csv, or to F.json what --json prints."),
+        typer.Option(
+            help="Write all points to F.csv, or to F.json what --json prints and "
+            "dpend.load_family reads."
+        ),
+    ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="Draw its angles, and its period by energy, into P.png, P.pdf or P.svg."),
     ] = None,
 ) -> Report:
     """All orbits of a family, as of a normal mode from small swings to the upright pendulum, and
@@ -188,13 +220,15 @@ def family(
         raise ValueError(f"branch must be given, or orbit, got neither: {', '.join(FAMILIES)}")
     start = one_of("branch", branch, FAMILIES) if orbit is None else read_orbit(orbit, pendulum)
     formats = _formats(out, {".csv": write_family_csv, ".json": write_json})
+    check_figure(figure)
     with clock("following the family"):
         found = dpend.follow_family(pendulum, start)
         if special is not None:
             found = _branch_of(pendulum, found, special)
     record = family_record(found, branch)
-    _write(record, out, formats)
-    return record, partial(print_family, record, out), converged(found)
+    _write(file_record(found, branch), out, formats)
+    draw_family(found, figure)
+    return record, partial(print_family, record, out, figure), converged(found)
 
 
 def _branch_of(pendulum: Pendulum, family: dpend.Family, special: int) -> dpend.Family:
@@ -235,11 +269,15 @@ def atlas(
             "hour."
         ),
     ] = float(MOST_SEARCH_STEPS),
+    figure: Annotated[
+        Path | None, typer.Option(help="Draw the orbits into P.png, P.pdf or P.svg.")
+    ] = None,
 ) -> Report:
     """Every orbit released from rest up to a period: of one release angle, or all families of the
     whole square.
     """
     _check_places(theta1, out, store)
+    check_figure(figure)
     steps = _steps_of_search(swinging_pendulum(pendulum), max_period, theta1)
     if steps <= most_steps:
         tell_cost(steps, steps * SECONDS_PER_STEP)
@@ -261,10 +299,11 @@ def atlas(
             )
     if out is not None:
         found.save(out)
+    draw_atlas(found, figure)
     families = all(family["status"] == "converged" for family in found.families)
     solved = families and bool(np.all(found.table["status"] == Status.CONVERGED))
     solved = solved and not (found.coverage.suspicious_cells or found.coverage.exhausted)
-    return found.record(), partial(print_atlas, found, theta1, out), solved
+    return found.record(), partial(print_atlas, found, theta1, out, figure), solved
 
 
 def _check_places(theta1: float | None, out: Path | None, store: Path | None) -> None:
@@ -285,51 +324,3 @@ def _steps_of_search(pendulum: Pendulum, max_period: float, theta1: float | None
     if theta1 is None:
         return survey.foresee_steps(pendulum, max_period)
     return foresee_steps(pendulum, max_period, radians("theta1", theta1))
-
-
-@command()
-def design(
-    pendulum: Pendulum,
-    theta1: Theta1,
-    branch: Annotated[
-        str | None,
-        typer.Option(metavar="|".join(BRANCHES), help="Whose --period and --kappa are meant."),
-    ] = None,
-    period: Annotated[float | None, numeric(help="Wanted period [s].")] = None,
-    kappa: Annotated[
-        float | None, numeric(help="Wanted kappa: stable from -1 to 1, most so at 0.")
-    ] = None,
-    ratio: Annotated[
-        float | None,
-        numeric(help="Wanted period of the in-phase orbit over that of the anti-phase orbit."),
-    ] = None,
-    free: Annotated[
-        str, typer.Option(metavar="NAMES", help="What may change, of l1,l2,m1,m2,g,theta1.")
-    ] = "l1,l2",
-    bounds: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=A:B", help="Bounds of one of them (theta1 in degrees); once a name."
-        ),
-    ] = None,
-) -> Report:
-    """The pendulum nearest to this one whose orbit released at THETA1 has a wanted period,
-    stability, or both.
-    """
-    equations, branches = equations_of(branch, period, kappa, ratio)
-    if not 0 < number("theta1", theta1, unit="deg") < 180:
-        raise ValueError(
-            f"theta1 must be between 0 and 180 deg, got {theta1:g}: give another theta1"
-        )
-
-    def loss(*orbits: PeriodicOrbit) -> Any:
-        by_name = dict(zip(branches, orbits, strict=True))
-        return jax.numpy.stack([equation(by_name) for equation in equations.values()])
-
-    names, limits, angle = names_in(free), bounds_in(bounds or []), radians("theta1", theta1)
-    with clock("designing"):
-        found = dpend.design_pendulum(
-            loss, pendulum, names, branch=branches, theta1=angle, bounds=limits
-        )
-    record = design_record(found, pendulum, branches, tuple(equations))
-    return record, partial(print_design, record, theta1), converged(found)

@@ -1,36 +1,45 @@
-"""Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them), of maps
-and of fits.
+"""Pictures of a motion (path, angles and energies, the rods as a stroboscope sees them), of orbits
+and families, of maps, sections and fits.
 
-Each function draws into the axes it is given, or into new ones, and returns them. Colours are from
-Okabe and Ito's palette, told apart by the colour-blind: blue for the upper rod and bob, vermilion
-for the lower.
+A function draws into the axes it is given, or into new ones, and returns them. It hands further
+keywords (`color`, `linewidth`, `cmap` and their like) to the function of matplotlib that it draws
+with. Colours are from Okabe and Ito's palette, told apart by the colour-blind: blue for the upper
+rod and bob, vermilion for the lower.
 """
 
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
+from dpend.catalogue.atlas import Atlas
 from dpend.checks import instance, integer, one_of, shown, single
+from dpend.family_picture import PLANES, draw_atlas, draw_family, draw_legend
+from dpend.fit_picture import draw_residuals
 from dpend.inverse.estimates import Fit
 from dpend.map_picture import LABELS, draw_map
-from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies, positions
+from dpend.mechanics.pendulum import Pendulum, check_pendulum, energies
 from dpend.motion.trajectory import Trajectory
+from dpend.motion_picture import (
+    COLORS,
+    LOWER,
+    NEUTRAL,
+    UPPER,
+    draw_strobe,
+    joints_of,
+    legend_above,
+    line_style,
+    pick_poses,
+)
 from dpend.orbits.family import Family
 from dpend.orbits.orbit import PeriodicOrbit
-from dpend.section_picture import draw_periodic, draw_section
+from dpend.section_picture import check_variables, draw_periodic, draw_section
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-UPPER, LOWER, NEUTRAL = "#0072B2", "#D55E00", "#555555"
-# Marks along a path, and pictures of a strobe: enough to see the speed, few enough to see each.
+# Poses of half an orbit: each falls on a saved time, and both rests are among them.
 _STROBES = 13
-# The marks of a family's special points, by the beginning of their kind.
-_MARKS = {"resonance": "|", "fold": "^", "stability": "o"}
-# Orbits are drawn as stable up to this log |kappa|, which is zero on stable ones but for rounding.
-_STABLE = 1e-9
 
 
 def _axes(ax: Any) -> "Axes":
@@ -45,7 +54,6 @@ def _axes(ax: Any) -> "Axes":
     if ax is not None:
         instance("ax", ax, Axes, "those of matplotlib.pyplot.subplots()")
         return ax
-
     return plt.subplots(figsize=(4.5, 4.0), layout="constrained")[1]
 
 
@@ -53,59 +61,67 @@ def _check_motion(motion: Any) -> None:
     instance("motion", motion, Trajectory, "what dpend.simulate returns")
 
 
-def _legend_above(ax: "Axes", columns: int) -> None:
-    """A legend in room of its own above the curves, which fill the axes from side to side."""
-    low, high = ax.get_ylim()
-    ax.set_ylim(low, high + 0.25 * (high - low))
-    ax.legend(frameon=False, fontsize="small", loc="upper center", ncols=columns)
+def path(motion: Trajectory | Any, ax: "Axes | Any | None" = None, **style: Any) -> "Axes":
+    """The path in the plane of the two angles [deg], with a dot at the release.
 
-
-def path(motion: Trajectory | Any, ax: "Axes | Any | None" = None) -> "Axes":
-    """The path in the plane of the two angles [deg], with a dot at the release."""
+    Arguments:
+        style: of the line, for `Axes.plot`.
+    """
     _check_motion(motion)
     ax = _axes(ax)
     theta1, theta2 = np.degrees(motion.state.theta1), np.degrees(motion.state.theta2)
-    ax.plot(theta1, theta2, color=NEUTRAL, linewidth=1.2)
+    ax.plot(theta1, theta2, **line_style(style, color=NEUTRAL, linewidth=1.2))
     ax.plot(theta1[0], theta2[0], "o", color="black", markersize=4)
     ax.set_xlabel("theta1 (deg)")
     ax.set_ylabel("theta2 (deg)")
     return ax
 
 
-def angles(motion: Trajectory | Any, ax: "Axes | Any | None" = None) -> "Axes":
-    """Both angles [deg] against time [s]."""
+def angles(motion: Trajectory | Any, ax: "Axes | Any | None" = None, **style: Any) -> "Axes":
+    """Both angles [deg] against time [s].
+
+    Arguments:
+        style: of both lines, for `Axes.plot`.
+    """
     _check_motion(motion)
     ax = _axes(ax)
-    ax.plot(motion.time, np.degrees(motion.state.theta1), color=UPPER, label="theta1")
-    ax.plot(
-        motion.time, np.degrees(motion.state.theta2), color=LOWER, label="theta2", linestyle="--"
-    )
+    for name, color, dashes in (("theta1", UPPER, "-"), ("theta2", LOWER, "--")):
+        look = line_style(style, color=color, linestyle=dashes, label=name)
+        ax.plot(motion.time, np.degrees(getattr(motion.state, name)), **look)
     ax.set_xlabel("time (s)")
     ax.set_ylabel("angle (deg)")
-    _legend_above(ax, columns=2)
+    legend_above(ax, columns=2)
     return ax
 
 
 def energy(
-    pendulum: Pendulum | Any, motion: Trajectory | Any, ax: "Axes | Any | None" = None
+    pendulum: Pendulum | Any,
+    motion: Trajectory | Any,
+    ax: "Axes | Any | None" = None,
+    **style: Any,
 ) -> "Axes":
     """Kinetic and potential energy of both bobs [J] against time [s], each bob's zero where it
     hangs at rest.
+
+    Arguments:
+        style: of all four lines, for `Axes.plot`.
     """
     check_pendulum(pendulum)
     _check_motion(motion)
     ax = _axes(ax)
     bobs = energies(pendulum, motion.state)
-    for values, colour, style, label in (
+    for values, color, dashes, label in (
         (bobs.kinetic1, UPPER, "-", "kinetic, upper bob"),
         (bobs.potential1, UPPER, ":", "potential, upper bob"),
         (bobs.kinetic2, LOWER, "-", "kinetic, lower bob"),
         (bobs.potential2, LOWER, ":", "potential, lower bob"),
     ):
-        ax.plot(motion.time, values, color=colour, linestyle=style, label=label)
+        ax.plot(
+            motion.time, values, **line_style(style, color=color, linestyle=dashes, label=label)
+        )
     ax.set_xlabel("time (s)")
     ax.set_ylabel("energy (J)")
-    _legend_above(ax, columns=2)
+    legend_above(ax, columns=2)
     return ax
 
 
@@ -113,21 +129,24 @@ def strobe(
     pendulum: Pendulum | Any,
     motion: Trajectory | Any,
     ax: "Axes | Any | None" = None,
-    every: int | Any = 1,
+    every: int | Any | None = None,
+    **style: Any,
 ) -> "Axes":
-    """The rods at every `every`-th saved time [positions in m], later ones darker."""
+    """The rods as a stroboscope sees them [positions in m], later ones darker, over the path of the
+    lower bob.
+
+    Arguments:
+        every: shows every so many-th saved time; by default 15 of them, evenly spaced, or all if
+            there are fewer.
+        style: of the rods, for `Axes.plot`.
+    """
     check_pendulum(pendulum)
     _check_motion(motion)
-    every, ax = integer("every", every), _axes(ax)
-    seen = jax.tree.map(lambda leaf: np.asarray(leaf)[::every], motion.state)
-    x1, y1, x2, y2 = (np.asarray(value) for value in positions(pendulum, seen))
-    for i in range(x1.size):
-        fade = 0.25 + 0.75 * (i + 1) / x1.size
-        ax.plot([0, x1[i]], [0, y1[i]], color=UPPER, alpha=fade, linewidth=1)
-        ax.plot([x1[i], x2[i]], [y1[i], y2[i]], color=LOWER, alpha=fade, linewidth=1)
-        ax.plot(x1[i], y1[i], "o", color=UPPER, alpha=fade, markersize=4)
-        ax.plot(x2[i], y2[i], "o", color=LOWER, alpha=fade, markersize=4)
-    ax.plot(0, 0, "s", color="black", markersize=3)
+    every = None if every is None else integer("every", every)
+    ax, joints = _axes(ax), joints_of(pendulum, motion.state)
+    count = len(joints)
+    chosen = pick_poses(count) if every is None else np.arange(0, count, every)
+    draw_strobe(ax, joints, chosen, (UPPER, LOWER), line_style(style))
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("x (m)")
     ax.set_ylabel("y (m)")
@@ -177,8 +196,7 @@ def family(
     ax: "Axes | Any | None" = None,
     *,
     plane: str | Any = "angles",
-    colour: str | Any = UPPER,
-    label: str | Any = "",
+    **style: Any,
 ) -> "Axes":
     """A family of orbits: solid where they are stable (|kappa| <= 1), dashed where not, its special
     points marked.
@@ -188,57 +206,81 @@ def family(
 
     Arguments:
         plane: `angles` for the releases (theta1, theta2) [deg], `period` for the period [s] against
-            the energy [J].
+            the energy [J], `upright` for the period against how far the energy lies below that of
+            the upright state, on a logarithmic axis.
+        style: of the curve, for `Axes.plot`: `color`, `label` and their like.
     Raises:
-        ValueError: another plane; no colour of matplotlib's.
+        ValueError: another plane; no family.
     """
-    from matplotlib.colors import is_color_like
-
     instance("curve", curve, Family, "what dpend.follow_family returns")
-    plane = one_of("plane", plane, ("angles", "period"))
-    if not is_color_like(colour):
-        raise ValueError(
-            f'colour must be one that matplotlib knows, got {shown(colour)}: give one like "black"'
-        )
-    if not isinstance(label, str):
-        raise ValueError(f'label must be text, got {shown(label)}: give one like "in phase"')
+    plane = one_of("plane", plane, tuple(PLANES))
     ax = _axes(ax)
-    side = np.sign(np.mean(curve.orbits.theta1))
-
-    def where(orbits: PeriodicOrbit) -> tuple[Any, Any]:
-        if plane == "angles":
-            return side * np.degrees(orbits.theta1), side * np.degrees(orbits.theta2)
-        return np.asarray(orbits.energy), np.asarray(orbits.period)
-
-    x, y = where(curve.orbits)
-    stable = np.asarray(curve.orbits.log_abs_kappa) <= _STABLE
-    # A piece between a stable and an unstable orbit is drawn as unstable, up to the point where
-    # that changes.
-    pieces = stable[:-1] & stable[1:]
-    solid = np.append(pieces, False) | np.append(False, pieces)
-    ax.plot(x, y, color=colour, linestyle=(0, (4, 2)), linewidth=1.1)
-    ax.plot(np.where(solid, x, np.nan), y, color=colour, linewidth=1.8, label=label or None)
-    hollow: dict[str, Any] = {"c": colour, "mfc": "white", "ms": 6, "ls": "none"}
-    for start, mark in _MARKS.items():
-        points = [point.orbit for point in curve.special_points if point.kind.startswith(start)]
-        if points:
-            ax.plot(*np.transpose([where(orbit) for orbit in points]), mark, **hollow)
-    ax.set_xlabel("theta1 (deg)" if plane == "angles" else "energy (J)")
-    ax.set_ylabel("theta2 (deg)" if plane == "angles" else "period (s)")
+    draw_family(ax, curve, plane, line_style(style, color=UPPER))
     return ax
 
 
-def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" = None) -> "Axes":
+def families(
+    curves: dict[str, Family] | Any,
+    ax: "Axes | Any | None" = None,
+    *,
+    plane: str | Any = "angles",
+    **style: Any,
+) -> "Axes":
+    """Several named families in one plot, each in a colour of its own, with a legend: see `family`.
+
+    Raises:
+        ValueError: another plane; no dictionary of families.
+    """
+    if not isinstance(curves, dict) or not curves:
+        raise ValueError(
+            f"curves must be a dictionary of families, got {shown(curves)}: give one like "
+            f"{{'in-phase': family}}"
+        )
+    for name, curve in curves.items():
+        instance(f"curves[{name!r}]", curve, Family, "what dpend.follow_family returns")
+    plane = one_of("plane", plane, tuple(PLANES))
+    ax = _axes(ax)
+    for i, (name, curve) in enumerate(curves.items()):
+        draw_family(ax, curve, plane, line_style(style, color=COLORS[i % len(COLORS)], label=name))
+    draw_legend(ax, curves.values())
+    return ax
+
+
+def atlas(found: Atlas | Any, ax: "Axes | Any | None" = None, **style: Any) -> "Axes":
+    """The orbits of an atlas: filled where they are stable, hollow where not.
+
+    Of the whole square the releases [deg], a colour for each family; of a single release angle the
+    period [s] against theta2 [deg].
+
+    Arguments:
+        style: of the marks, for `Axes.plot`.
+    Raises:
+        ValueError: no atlas.
+    """
+    instance("found", found, Atlas, "what dpend.find_brake_families returns")
+    ax = _axes(ax)
+    draw_atlas(ax, found, line_style(style))
+    return ax
+
+
+def map_of(
+    dataset: Any,
+    name: str | Any | None = None,
+    ax: "Axes | Any | None" = None,
+    **style: Any,
+) -> "Axes":
     """One value of a two-dimensional sweep in colours, its first axis to the right, its second
     upwards.
 
     Angles are in degrees. Values over decades (errors, drifts, times) have a logarithmic scale.
     Cells without a finite value are white: failed ones, and on a flip map those that do not flip;
-    there a line bounds the releases that lack the energy for it.
+    there a line bounds the releases that lack the energy for it. The title tells the duration and
+    the pendulum.
 
     Arguments:
         dataset: what `sweep` returned.
         name: which value; by default the first that this page knows, or the first.
+        style: of the cells, for `Axes.pcolormesh`, such as `cmap`, `vmin` and `vmax`.
     Raises:
         ValueError: the dataset has not two dimensions, or no such value.
     """
@@ -254,11 +296,17 @@ def map_of(dataset: Any, name: str | Any | None = None, ax: "Axes | Any | None" 
             f"dataset must have two dimensions to be a map, got {field.ndim}: plot it as a curve"
         )
     ax = _axes(ax)
-    draw_map(ax, dataset, name)
+    draw_map(ax, dataset, name, style)
     return ax
 
 
-def section(dataset: Any, ax: "Axes | Any | None" = None, *, periodic: Any | None = None) -> "Axes":
+def section(
+    dataset: Any,
+    ax: "Axes | Any | None" = None,
+    *,
+    periodic: Any | None = None,
+    **style: Any,
+) -> "Axes":
     """A section: the crossings as dots, one colour a motion, inside the line that bounds what the
     energy allows.
 
@@ -270,33 +318,25 @@ def section(dataset: Any, ax: "Axes | Any | None" = None, *, periodic: Any | Non
         dataset: what `section` returned.
         periodic: what `periodic_points` returned on the same plane, or a list of such: rings where
             |kappa| <= 1, crosses where the orbit is unstable.
+        style: of the dots, for `Axes.scatter`.
     Raises:
         ValueError: other datasets.
     """
     import xarray
 
     instance("dataset", dataset, xarray.Dataset, "what dpend.section returns")
-    _check_variables("dataset", dataset, ("angle", "momentum", "side"), "dpend.section")
+    check_variables("dataset", dataset, ("angle", "momentum", "side"), "dpend.section")
     several = periodic if isinstance(periodic, (list, tuple)) else [periodic]
     marked = [] if periodic is None else several
     for one in marked:
         instance("periodic", one, xarray.Dataset, "what dpend.periodic_points returns")
         names = ("angle", "momentum", "kappa")
-        _check_variables("periodic", one, names, "dpend.periodic_points")
+        check_variables("periodic", one, names, "dpend.periodic_points")
     ax = _axes(ax)
-    draw_section(ax, dataset)
+    draw_section(ax, dataset, style)
     for one in marked:
         draw_periodic(ax, one)
     return ax
-
-
-def _check_variables(name: str, dataset: Any, wanted: tuple[str, ...], source: str) -> None:
-    missing = [key for key in wanted if key not in dataset]
-    if missing:
-        raise ValueError(
-            f"{name} must hold {', '.join(wanted)}, got one without {missing[0]}: give what "
-            f"{source} returns"
-        )
 
 
 def residuals(fit: Fit | Any) -> "Figure":
@@ -306,31 +346,5 @@ def residuals(fit: Fit | Any) -> "Figure":
     Measured angles are dots, shown in the turn in which the fitted motion is, which is drawn as a
     line; blue for the upper rod and vermilion for the lower.
     """
-    import matplotlib.pyplot as plt
-
     instance("fit", fit, Fit, "what dpend.fit_parameters returns")
-    fig, grid = plt.subplots(
-        3,
-        1,
-        figsize=(9.0, 6.6),
-        sharex=True,
-        layout="constrained",
-        gridspec_kw={"height_ratios": [2.2, 1, 1]},
-    )
-    both = (
-        ("theta1", fit.theta1, fit.residual1, UPPER, "-"),
-        ("theta2", fit.theta2, fit.residual2, LOWER, "--"),
-    )
-    band = 2 * float(np.degrees(fit.noise))
-    for (name, angle, left, colour, style), ax in zip(both, grid[1:], strict=True):
-        grid[0].plot(fit.time, np.degrees(angle), style, c=colour, lw=1.0, label=f"{name}, fitted")
-        measured = np.degrees(angle + left)
-        grid[0].plot(fit.time, measured, ".", c=colour, ms=3, label=f"{name}, measured")
-        ax.axhspan(-band, band, color=NEUTRAL, alpha=0.15, linewidth=0)
-        ax.axhline(0, color=NEUTRAL, linewidth=0.8)
-        ax.plot(fit.time, np.degrees(left), ".", color=colour, markersize=3)
-        ax.set_ylabel(f"{name} residual (deg)", fontsize="small")
-    grid[0].set_ylabel("angle (deg)")
-    grid[2].set_xlabel("time (s)")
-    _legend_above(grid[0], columns=2)
-    return fig
+    return draw_residuals(fit)

@@ -30,9 +30,12 @@ _SUFFIXES = {
     "J": "_J",
 }
 
-# How files tell what the numbers of a status mean (the CF conventions, section 3.5).
+# Rows of a table in a notebook.
+_SHOWN_ROWS = 10
+# How files tell what the numbers of a status mean (the CF conventions, section 3.5): numbers up to
+# 255, in a type that NetCDF 3 has, too.
 _FLAGS = {
-    "flag_values": np.array(list(Status), np.uint8),
+    "flag_values": np.array(list(Status), np.int16),
     "flag_meanings": " ".join(one.name.lower() for one in Status),
 }
 
@@ -138,7 +141,7 @@ def variables(
     for name, (value, unit) in table.items():
         data[name] = (dim, value, {"units": unit} if unit else {})
         if name == "status":
-            data[name] = (dim, value.astype(np.uint8), _FLAGS)
+            data[name] = (dim, value.astype(np.int16), _FLAGS)
     degrees = {
         f"{name}_deg": (dim, np.degrees(value), {"units": "degree"})
         for name, (value, unit) in table.items()
@@ -173,6 +176,19 @@ def outcome(status: Any) -> str:
     if np.ndim(status) == 0:
         return names[0]
     return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True))
+
+
+def html(result: Any) -> str:
+    """A result as a notebook shows it: its `repr`, and the first and last rows of its table; of
+    what is traced the former alone.
+    """
+    from html import escape
+
+    told = f"<p><code>{escape(repr(result))}</code></p>"
+    try:
+        return told + str(result.to_dataframe().to_html(max_rows=_SHOWN_ROWS, border=0))
+    except TypeError:  # of JAX, where a number is none yet
+        return told
 
 
 def parse_json(text: str) -> Any:

@@ -14,7 +14,7 @@ from dpend.mechanics.pendulum import Pendulum
 from dpend.motion.trajectory import Trajectory
 from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.files import orbit_record
-from dpend.records import columns, json_text, record
+from dpend.records import json_text, record
 from dpend.status import Status
 from dpend.tables import print_table
 
@@ -28,32 +28,6 @@ _SLOPES = {
 }
 # The same as columns of the table, with their headings.
 _SLOPE_HEADINGS = {"period_s": "period (s)", "kappa": "kappa", "theta2_deg": "theta2 (deg)"}
-
-
-def family_record(family: dpend.Family, branch: str | None) -> dict[str, Any]:
-    """Momenta only where they are not zero."""
-    rests = family.symmetry in RELEASED_SYMMETRIES
-    table = columns(family, "arclength")
-    table |= columns(family.orbits.state, "theta1 theta2")
-    table |= columns(family.orbits, "period energy kappa log_abs_kappa error_estimate")
-    table |= {} if rests else columns(family.orbits.state, "p1 p2")
-    points = [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
-    return {
-        "branch": branch,
-        "symmetry": family.symmetry,
-        "points": [point | {"symmetry": family.symmetry} for point in points],
-        "bifurcations": [
-            {
-                **record(point, "kind arclength"),
-                **record(point.orbit.state, "theta1 theta2"),
-                **record(point.orbit, "period energy kappa"),
-                **({} if rests else record(point.orbit.state, "p1 p2")),
-            }
-            for point in family.special_points
-        ],
-        **record(family, "ends status message"),
-        "pendulum": record(jax.tree.map(lambda leaf: leaf[0], family.orbits.pendulum)),
-    }
 
 
 def motion_record(motion: Trajectory) -> dict[str, Any]:
@@ -126,7 +100,7 @@ def _describe(pendulum: Pendulum, symmetry: str = "") -> str:
 
 
 def print_orbits(
-    pendulum: Pendulum, records: Sequence[dict[str, Any]], out: Path | None = None
+    pendulum: Pendulum, records: Sequence[dict[str, Any]], *written: Path | None
 ) -> None:
     symmetry = records[0]["symmetry"]
     rests = symmetry in RELEASED_SYMMETRIES
@@ -148,10 +122,10 @@ def print_orbits(
     print_table(_describe(pendulum, symmetry), (*headings, "error (deg, s)"), rows)
     for one in records:
         _print_failure(one, f"{one.get('branch') or 'guess'}: ")
-    _print_place(out)
+    _print_places(*written)
 
 
-def print_family(found: dict[str, Any], out: Path | None) -> None:
+def print_family(found: dict[str, Any], *written: Path | None) -> None:
     points, symmetry = found["points"], found["symmetry"]
     chosen = np.unique(np.linspace(0, len(points) - 1, _SHOWN_POINTS).round().astype(int))
     special = [row | {"number": str(i)} for i, row in enumerate(found["bifurcations"], start=1)]
@@ -166,12 +140,13 @@ def print_family(found: dict[str, Any], out: Path | None) -> None:
     ends = "{} {} orbits from {} to {}".format(len(points), symmetry, *found["ends"])
     print(f"{ends}; error of {what} at most {worst:.0e} deg")
     _print_failure(found)
-    _print_place(out)
+    _print_places(*written)
 
 
-def _print_place(out: Path | None) -> None:
-    if out is not None:
-        print(f"written to {out}")
+def _print_places(*written: Path | None) -> None:
+    for place in written:
+        if place is not None:
+            print(f"written to {place}")
 
 
 def _momenta(row: dict[str, Any]) -> tuple[str, str]:
@@ -195,7 +170,7 @@ def _family_point(row: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> None:
+def print_atlas(atlas: dpend.Atlas, theta1: float | None, *written: Path | None) -> None:
     title = _describe(atlas.pendulum)
     if theta1 is None:
         families = [_family_row(atlas, one) for one in atlas.families]
@@ -222,7 +197,7 @@ def print_atlas(atlas: dpend.Atlas, theta1: float | None, out: Path | None) -> N
         f"{seen.suspicious_cells} suspicious cells; the signs of all returns and the winding "
         f"number {agree}"
     )
-    _print_place(out)
+    _print_places(*written)
 
 
 def _atlas_row(row: dict[str, Any]) -> tuple[str, ...]:
@@ -290,7 +265,7 @@ def print_design(found: dict[str, Any], theta1: float) -> None:
     _print_failure(found)
 
 
-def print_motion(found: dict[str, Any], times: int, out: Path | None) -> None:
+def print_motion(found: dict[str, Any], times: int, out: Path | None, figure: Path | None) -> None:
     final = found["final"]
     angles = f"theta1 = {final['theta1_deg']:.9f} deg, theta2 = {final['theta2_deg']:.9f} deg"
     print(f"after {found['duration_s']:g} s   {angles}")
@@ -302,6 +277,8 @@ def print_motion(found: dict[str, Any], times: int, out: Path | None) -> None:
     _print_failure(found)
     if out is not None:
         print(f"written to      {out}: {times} times")
+    if figure is not None:
+        print(f"drawn in        {figure}")
 
 
 def print_map(found: dict[str, Any], figure: Path | None) -> None:

@@ -15,11 +15,10 @@ from dpend.maps.section import STEPS_A_CROSSING, check_new
 from dpend.mechanics.pendulum import Pendulum
 from dpend.mechanics.surface import Plane
 from dpend.options import Report, command, counted, numeric, radians
-from dpend.places import check_place
 from dpend.report import print_section
 from dpend.status import Status
 from dpend.terminal import bar, on_terminal, tell_cost
-from dpend.writing import draw_section
+from dpend.writing import check_figure, draw_section
 
 # Steps that a core takes in a second, and memory of a crossing while it is computed [bytes].
 _RATE, _BYTES = 2e6, 200
@@ -32,7 +31,7 @@ def section(
         float, numeric(help="H [J], zero for both bobs at rest at the pivot's height.")
     ],
     angle: Annotated[
-        str, typer.Option(help="theta1 or theta2: whose plane is crossed.")
+        str, typer.Option(metavar="theta1|theta2", help="Whose plane is crossed.")
     ] = "theta1",
     at: Annotated[float, numeric(help="The value of that angle on the plane [deg].")] = 0.0,
     starts: Annotated[int, counted("How many motions fill the energy surface.")] = 64,
@@ -49,8 +48,7 @@ def section(
     periodic = integer("periodic", periodic, least=0)
     if out is not None:
         check_new("out", out)
-    if figure is not None:
-        check_place("figure", figure, (".png",))
+    check_figure(figure)
     steps = float(STEPS_A_CROSSING) * starts * count
     tell_cost(steps, steps / (_RATE * jax.local_device_count()), float(_BYTES) * starts * count)
     began = time.perf_counter()

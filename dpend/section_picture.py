@@ -30,7 +30,7 @@ def plane_of(dataset: Any) -> Plane:
     return Plane(dataset.attrs["plane"], float(dataset.attrs["plane_at"]))
 
 
-def draw_section(ax: "Axes", dataset: Any) -> None:
+def draw_section(ax: "Axes", dataset: Any, style: dict[str, Any]) -> None:
     """Draws the crossings of side 1; on a plane at 0 or pi those of side -1 in the mirror, where
     the same motions, run backwards, have theirs.
     """
@@ -43,10 +43,10 @@ def draw_section(ax: "Axes", dataset: Any) -> None:
         shown = side != 0
     which = np.broadcast_to(np.arange(angle.shape[0])[:, None] * 0.381966 % 1.0, angle.shape)
     size = _DOT * min(1.0, (_FEW / max(shown.sum(), 1)) ** 0.5)
-    ax.scatter(
-        np.degrees(angle[shown]), momentum[shown], c=which[shown], s=size, cmap="turbo",
-        vmin=0.0, vmax=1.0, linewidths=0, rasterized=True,
-    )  # fmt: skip
+    dots = {"s": size, "linewidths": 0, "rasterized": True}
+    if not style.keys() & {"c", "color"}:
+        dots |= {"c": which[shown], "cmap": "turbo", "vmin": 0.0, "vmax": 1.0}
+    ax.scatter(np.degrees(angle[shown]), momentum[shown], **(dots | style))
     _draw_edge(ax, dataset, plane)
     other, own = plane.coordinates
     ax.set_xlabel(f"{other} (deg)")
@@ -72,3 +72,12 @@ def draw_periodic(ax: "Axes", points: Any) -> None:
         chosen = (np.abs(points.kappa.values) <= 1.0) == stable
         angle, momentum = points.angle.values[chosen], points.momentum.values[chosen]
         ax.scatter(np.degrees(angle).ravel(), momentum.ravel(), zorder=3, **marks)
+
+
+def check_variables(name: str, dataset: Any, wanted: tuple[str, ...], source: str) -> None:
+    missing = [key for key in wanted if key not in dataset]
+    if missing:
+        raise ValueError(
+            f"{name} must hold {', '.join(wanted)}, got one without {missing[0]}: give what "
+            f"{source} returns"
+        )

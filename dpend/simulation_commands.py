@@ -17,21 +17,23 @@ import dpend
 from dpend.checks import number
 from dpend.maps.cost import Cost
 from dpend.maps.store import check_store
-from dpend.mechanics.pendulum import Pendulum, State
+from dpend.mechanics.pendulum import Pendulum
 from dpend.methods.scheme import METHODS
 from dpend.motion.simulate import MOST_MOTION_STEPS
 from dpend.options import (
+    Omega1,
+    Omega2,
     Report,
     Theta1,
     cells_in,
     command,
     counted,
+    moving_state,
     names_in,
     numeric,
     radians,
     size_in,
 )
-from dpend.places import check_place
 from dpend.report import (
     converged,
     fit_record,
@@ -43,13 +45,15 @@ from dpend.report import (
 )
 from dpend.status import Status
 from dpend.terminal import bar, clock, complaints_of_stores, on_terminal, tell_cost
-from dpend.writing import draw, draw_fit, writer
+from dpend.writing import check_figure, draw, draw_fit, draw_motion, writer
 
 # Speed [steps/s] and memory [bytes/step] of a motion at order 8 with its second pass, all states
 # saved, on two cores.
 _STEPS_A_SECOND, _BYTES_A_STEP = 5e4, 250
 # Rows of a map that are read at once, to be counted.
 _ROWS = 256
+# Methods of even steps, which can save states at any of them.
+_EVEN = [name for name, method in METHODS.items() if method.even]
 _MAPS = {
     "lyapunov": dpend.chaos.lyapunov,
     "megno": dpend.chaos.megno,
@@ -65,14 +69,17 @@ def simulate(
     theta2: Annotated[float, numeric(help="Release angle of the lower rod [deg].")],
     duration: Annotated[float, numeric(help="How long [s]; negative runs backwards.")],
     p1: Annotated[
-        float, numeric("--p1", help="Canonical momentum of the upper angle [kg m^2/s].")
-    ] = 0.0,
+        float | None,
+        numeric("--p1", help="Canonical momentum of the upper angle [kg m^2/s]; 0 if not given."),
+    ] = None,
     p2: Annotated[
-        float, numeric("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")
-    ] = 0.0,
+        float | None, numeric("--p2", help="Canonical momentum of the lower angle [kg m^2/s].")
+    ] = None,
+    omega1: Omega1 = None,
+    omega2: Omega2 = None,
     method: Annotated[
         str | None,
-        typer.Option(help="With --step: rk4, rk8 (default), gauss, rk4-circle or rk8-circle."),
+        typer.Option(metavar="|".join(_EVEN), help="With --step; rk8 if not given."),
     ] = None,
     step: Annotated[float | None, numeric(help="Largest step [s].")] = None,
     tolerance: Annotated[
@@ -86,11 +93,15 @@ def simulate(
     out: Annotated[
         Path | None, typer.Option(help="Write the motion to F.csv (degrees) or F.nc (radians).")
     ] = None,
+    figure: Annotated[
+        Path | None,
+        typer.Option(help="Draw rods, path, angles and energies into P.png, P.pdf or P.svg."),
+    ] = None,
 ) -> Report:
     """The motion from a release, and how far its end may be believed."""
-    state = State(
-        radians("theta1", theta1), radians("theta2", theta2), number("p1", p1), number("p2", p2)
-    )
+    angles = radians("theta1", theta1), radians("theta2", theta2)
+    state = moving_state(pendulum, angles, (p1, p2), (omega1, omega2))
+    check_figure(figure)
     write = writer(out) if out is not None else None
     if step is not None and step > 0 and (steps := abs(duration / step)) <= most_steps:
         tell_cost(steps, steps / _STEPS_A_SECOND, steps * _BYTES_A_STEP)
@@ -99,8 +110,10 @@ def simulate(
         motion = dpend.simulate(pendulum, state, duration, **how)
     if write is not None:
         write(motion)
+    draw_motion(pendulum, motion, figure)
     record = motion_record(motion)
-    return record, partial(print_motion, record, motion.time.size, out), converged(motion)
+    show = partial(print_motion, record, motion.time.size, out, figure)
+    return record, show, converged(motion)
 
 
 @command("map")
@@ -147,8 +160,7 @@ def map_command(
     across, up = size_in(size)
     axes = {"theta1": cells_in("theta1", theta1, across), "theta2": cells_in("theta2", theta2, up)}
     check_store("out", out)
-    if figure is not None:
-        check_place("figure", figure, (".png",))
+    check_figure(figure)
     started, counts = time.perf_counter(), [0, 0, 0]
     with complaints_of_stores(), bar(on_terminal(), "cells") as show:
 
@@ -217,6 +229,7 @@ def animate(
     duration: Annotated[float, numeric(help="How long the motion lasts [s].")],
     out: Annotated[Path, typer.Option(help="F.gif, F.mp4, or F.png with all pictures in one.")],
     speed: Annotated[float, numeric(help="Seconds of the motion in a second of the film.")] = 1.0,
+    size: Annotated[int, counted("Pixels of the longer side, without the clock.")] = 480,
 ) -> Report:
     """A film of a motion in real time; of several, in one picture, where --theta1 and --theta2 are
     given again.
@@ -228,14 +241,14 @@ def animate(
             f"theta1 and theta2 must be given equally often, got {len(theta1)} and {len(theta2)}: "
             f"a release is both"
         )
-    animation.check_out(out)
+    animation.check_request(out, size)
     releases = [
         dpend.released(radians("theta1", one), radians("theta2", two))
         for one, two in zip(theta1, theta2, strict=True)
     ]
     motions = animation.motions_for(pendulum, releases, duration, speed=speed)
     with bar(on_terminal(), "frames") as show:
-        frames = animation.film(pendulum, motions, out, progress=show)
+        frames = animation.film(pendulum, motions, out, size=size, progress=show)
     record = {
         "frames": frames,
         "frames_per_second": animation.FRAMES_PER_SECOND if out.suffix != ".png" else None,
@@ -268,12 +281,11 @@ def fit(
     """The pendulum whose motion is nearest to measured angles, from a guess of it; one rod or
     single cells may lack.
     """
-    if figure is not None:
-        check_place("figure", figure, (".png",))
-        if figure.resolve() == data.resolve():
-            raise ValueError(
-                f"figure must be another file than data, got {figure} for both: give another name"
-            )
+    check_figure(figure)
+    if figure is not None and figure.resolve() == data.resolve():
+        raise ValueError(
+            f"figure must be another file than data, got {figure} for both: give another name"
+        )
     sigma = None
     if noise is not None:
         sigma = math.radians(number("noise", noise, positive=True, unit="deg"))

@@ -1,8 +1,9 @@
 """Both families of normal modes of the paper's pendulum, to the upright state, and what branches
 off.
 
-Left the releases in the plane of both angles, right the period against the energy: solid where
-orbits are stable, dashed where not. The six releases that the paper found by hand lie on the two
+Left the releases in the plane of both angles, in the middle the period against the energy, right
+against its logarithmic distance from that of the upright state: solid where orbits are stable,
+dashed where not. The six releases that the paper found by hand lie on the two
 curves. The script prints where stability and resonances are, checks orbits of every family with
 diffrax, and compares how the period grows with the slow exponent of the upright equilibrium.
 """
@@ -79,11 +80,12 @@ def main() -> None:
     import matplotlib.pyplot as plt
 
     pendulum = dpend.Pendulum()
-    fig, axes = plt.subplots(1, 2, figsize=(11.5, 5.4), layout="constrained")
+    fig, axes = plt.subplots(1, 3, figsize=(16, 5.4), layout="constrained")
 
     def draw(family: dpend.Family, colour: str, label: str) -> None:
-        plots.family(family, axes[0], plane="angles", colour=colour, label=label)
-        plots.family(family, axes[1], plane="period", colour=colour, label=label)
+        plots.family(family, axes[0], plane="angles", color=colour, label=label)
+        plots.family(family, axes[1], plane="period", color=colour, label=label)
+        plots.family(family, axes[2], plane="upright", color=colour, label=label)
 
     for branch, colour in (("in-phase", plots.UPPER), ("anti-phase", plots.LOWER)):
         family = dpend.follow_family(pendulum, branch, longest_step=0.25 if options.quick else 0.05)
@@ -124,6 +126,7 @@ def main() -> None:
         xlim=(-8, 200), ylim=(-215, 200), xticks=range(0, 181, 45), yticks=range(-180, 181, 45)
     )
     axes[1].set(xlim=(-0.62, 0.63), ylim=(0, 8.5))
+    axes[2].set(xlim=(2, 1e-9), ylim=(0, 20))
     axes[1].axvline(
         dpend.equilibria(pendulum).energy[3], color=plots.NEUTRAL, linewidth=0.8, linestyle=":"
     )
@@ -143,7 +146,7 @@ def main() -> None:
             [], [], color="black", marker=mark, markerfacecolor=white, linestyle="none"
         )
     axes[1].legend(once.values(), once.keys(), loc="upper left", fontsize="small", frameon=False)
-    fig.savefig(options.figure, dpi=110)
+    fig.savefig(options.figure, dpi=85)
     print(f"drawn in {options.figure.name}")
 
 

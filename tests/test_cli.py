@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from typer.main import get_command
 
+import dpend
 import dpend.catalogue.release
 import dpend.catalogue.scan
 from dpend import cli, report, terminal, writing
@@ -145,7 +147,7 @@ def test_a_map_and_its_resumption(capsys, tmp_path, quantity, value):
         (("theta1", "10:-10"), "theta1 must be a range A:B with A below B"),
         (("theta2", "10"), "theta2 must be a range A:B in degrees"),
         (("duration", "-1"), "duration must be a finite positive number"),
-        (("figure", "here.pdf"), "figure must end in .png"),
+        (("figure", "here.gif"), "figure must end in .png"),
         (
             ("figure", "/proc/m.png"),
             "figure must be a file in a directory that can be written to, got /proc/m.png",
@@ -268,6 +270,50 @@ def test_simulate(capsys, paper):
     assert motion["final"].keys() == {"theta1_deg", "theta2_deg", "p1", "p2"}
     assert motion["error_estimate"] < 1e-8
     assert motion["energy_drift"] < 1e-10
+
+
+def test_a_motion_by_its_angular_velocities(capsys, paper, tmp_path):
+    """The same state in momenta gives the same motion; and the picture is there."""
+    figure = tmp_path / "motion.svg"
+    rates = ("--omega1", 90, "--omega2", -30)
+    status, found = run_json(capsys, *SIMULATE, *rates, "--figure", figure)
+    assert status == 0
+    assert "<svg" in figure.read_text()
+    state = dpend.momenta(paper, *np.radians([40, 10, 90, -30]))
+    given = ("--p1", repr(float(state.p1)), "--p2", repr(float(state.p2)))
+    _, same = run_json(capsys, *SIMULATE, *given)
+    for name in ("theta1_deg", "theta2_deg", "p1", "p2"):
+        assert abs(found["final"][name] - same["final"][name]) < 1e-8
+    status, out, err = run(capsys, *SIMULATE, "--omega1", 1, "--p2", 1)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "omega1 and omega2 exclude p1 and p2, got p2 and omega1" in err
+
+
+def test_an_orbit_in_a_picture_and_a_film(capsys, tmp_path):
+    figure, film = tmp_path / "orbit.png", tmp_path / "orbit.gif"
+    words = ("orbit", "--theta1", 40, "--branch", "anti-phase")
+    status, out, err = run(capsys, *words, "--figure", figure, "--film", film)
+    assert (status, err) == (0, "")
+    assert [line for line in out.splitlines() if line.startswith("written")] == [
+        f"written to {figure}", f"written to {film}"
+    ]  # fmt: skip
+    with Image.open(film) as pictures:
+        # T = 0.754418866 s at 25 pictures a second; the next one would be the first again.
+        assert pictures.n_frames == 19
+    with Image.open(figure) as picture:
+        assert picture.width > 1000
+    for words, line in (
+        (("--theta1", 40, "--film", film), "film must be of one orbit, .* give --branch"),
+        (("--theta1", 40, "--branch", "in-phase", "--film", "f.png"), "film must end in .gif or"),
+        (("--theta1", 40, "--figure", "f.gif"), "figure must end in .png or .pdf or .svg"),
+        (
+            ("--theta1", 0, "--theta2", 0, "--omega1", 9, "--period", 1),
+            "omega2 must be given with an angular velocity",
+        ),
+    ):
+        status, out, err = run(capsys, "orbit", *words)
+        assert (status, out, err.count("\n")) == (2, "", 1)
+        assert re.search(line, err), err
 
 
 def test_files_hold_the_motion(capsys, tmp_path):
@@ -435,8 +481,6 @@ SIMULATE = ("simulate", "--theta1", "40", "--theta2", "10", "--duration", "1")
     ],
 )
 def test_bad_input_is_one_line_and_status_two(capsys, arguments, words):
-    import re
-
     status, out, err = run(capsys, *arguments)
     assert (status, out) == (2, "")
     assert re.search(words, err), err
@@ -487,7 +531,10 @@ def test_a_family_as_json_and_csv(capsys, tmp_path):
     assert abs(lost["theta1_deg"] - np.degrees(0.9890865027)) < 1e-8
     assert abs(lost["period_s"] - 6.1475153497 * np.sqrt(0.2 / 9.8)) < 1e-10
     out = tmp_path / "f.csv"
-    status, text, err = run(capsys, "family", "--branch", "anti-phase", "--out", out)
+    picture = tmp_path / "f.pdf"
+    words = ("family", "--branch", "anti-phase", "--out", out, "--figure", picture)
+    status, text, err = run(capsys, *words)
+    assert picture.read_bytes().startswith(b"%PDF")
     assert (status, err) == (0, "")
     assert "stability_lost" in text
     table = np.genfromtxt(out, delimiter=",", names=True, usecols=range(9))
@@ -495,7 +542,9 @@ def test_a_family_as_json_and_csv(capsys, tmp_path):
         table["theta2_deg"], [point["theta2_deg"] for point in found["points"]], rtol=1e-15
     )
     run(capsys, "family", "--branch", "anti-phase", "--out", tmp_path / "f.json")
-    assert json.loads((tmp_path / "f.json").read_text()) == found
+    written = json.loads((tmp_path / "f.json").read_text())
+    assert {key: written[key] for key in found} == found
+    assert dpend.load_family(tmp_path / "f.json").ends == ("normal mode", "homoclinic")
     for bad in (
         ("--branch", "sideways"),
         ("--branch", "in-phase", "--out", "f.txt"),
@@ -641,19 +690,21 @@ def test_the_atlas_of_the_square(capsys, tmp_path, monkeypatch):
 # too.
 FUZZED = {
     "orbit": (("--theta1", "40", "--branch", "in-phase"), "theta1 theta2 period branch symmetry "
-                                                          "p1 p2 ratio crossing out"),
-    "family": (("--branch", "in-phase"), "branch orbit special out"),
-    "atlas": (("--theta1", "40", "--max-period", "1"), "theta1 max-period out store"),
+                                                          "p1 p2 omega1 omega2 ratio crossing "
+                                                          "out figure film"),
+    "family": (("--branch", "in-phase"), "branch orbit special out figure"),
+    "atlas": (("--theta1", "40", "--max-period", "1"), "theta1 max-period out store figure"),
     "design": (
         ("--theta1", "60", "--branch", "in-phase", "--period", "1"), "theta1 branch period kappa "
                                                                      "ratio free bounds"
     ),
-    "simulate": (SIMULATE[1:], "theta1 theta2 duration p1 p2 method step tolerance most-steps out"),
+    "simulate": (SIMULATE[1:], "theta1 theta2 duration p1 p2 omega1 omega2 method step "
+                               "tolerance most-steps out figure"),
     "map": (
         ("flip", "--size", "4", "--duration", "1", "--out", "m.zarr"),
         "size duration theta1 theta2 tolerance method step error figure",
     ),
-    "animate": ((*ANIMATE[1:], "--out", "f.gif"), "theta1 theta2 duration speed out"),
+    "animate": ((*ANIMATE[1:], "--out", "f.gif"), "theta1 theta2 duration speed size out"),
     "fit": (("data.csv",), "free noise figure"),
 }  # fmt: skip
 HOSTILE = ("", "nan", "1e999", "1_000", "٤٠", "abc", "9" * 5000)
@@ -759,8 +810,6 @@ def _pairs(words, name):
 def test_what_has_no_effect_or_two_meanings_is_refused(
     capsys, monkeypatch, tmp_path, arguments, line
 ):
-    import re
-
     monkeypatch.chdir(tmp_path)
     status, out, err = run(capsys, *arguments.split())
     assert (status, out, err.count("\n")) == (2, "", 1)

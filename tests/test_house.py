@@ -28,7 +28,7 @@ maps.section maps.returns maps.periodic maps.rotation
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.path orbits.orbit orbits.derivatives orbits.samples
 orbits.zones orbits.special orbits.passages orbits.files orbits.through orbits.find orbits.family
-orbits.branching orbits.continuation
+orbits.family_files orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey
@@ -37,8 +37,9 @@ proofs.certificate proofs.certify proofs.ledger
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
-map_picture section_picture plots animate tables report writing reading terminal options
-orbit_commands proof_commands simulation_commands section_commands cli
+map_picture section_picture motion_picture film_picture fit_picture family_picture
+plots animate tables report terminal writing reading options
+orbit_commands design_commands proof_commands simulation_commands section_commands cli
 """.split()
 HOUSE = Path(dpend.__file__).parent
 # What the public names tell type checkers of, and import when it is first asked for.
@@ -48,7 +49,7 @@ LAZY = {("dpend", "plots"), ("dpend", "animate")}
 LONGEST_FILE, LONGEST_FUNCTION, MOST_BRANCHES = 350, 40, 12
 LONG_FILES = {"orbits/find.py", "orbits/special.py"}
 LONG_FUNCTIONS = {
-    "map_command", "atlas", "orbit", "simulate", "fit", "certify",  # options, one a line
+    "map_command", "atlas", "orbit", "family", "simulate", "fit", "certify",  # options, one a line
     "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation
     "find_orbit", "check_gradient", "_dopri8",
 }  # fmt: skip

@@ -48,6 +48,7 @@ def test_strobe_draws_rods_of_the_right_length(paper, motion):
     rods = [length[0] for length in lengths if length.size == 1]
     assert len(rods) == 2 * 11
     np.testing.assert_allclose(rods, 0.2, rtol=1e-14)
+    assert len(plots.strobe(paper, motion, lw=3).lines) == 4 * 15 + 1
 
 
 def test_orbit_sheet_shows_whole_orbits(paper):
@@ -96,8 +97,49 @@ def test_a_family_is_solid_where_it_is_stable(paper):
     assert reach < lost
     assert np.sum((family.orbits.energy > reach) & (family.orbits.energy < lost)) == 0
     assert sum(len(mark.get_xdata()) for mark in marks) == len(family.special_points)
-    with pytest.raises(ValueError, match="plane must be one of angles, period, got 'momenta'"):
+    with pytest.raises(ValueError, match="plane must be one of angles, period, upright, got 'mom"):
         plots.family(family, plane="momenta")
+    # Several in one: a colour and a name each; near the upright state the period grows like
+    # 2/lambda times minus the logarithm of the distance, a straight line here.
+    ax = plots.families({"fast": family, "again": family}, plane="upright", lw=3)
+    whole, solid = ax.lines[:2]
+    assert (solid.get_label(), solid.get_linewidth(), ax.get_xscale()) == ("fast", 3, "log")
+    assert ax.xaxis_inverted()
+    slow = np.min(np.abs(dpend.equilibria(paper).exponents[3].real))
+    gap, period = np.asarray(whole.get_xdata()), np.asarray(whole.get_ydata())
+    late = gap < 1e-6
+    slope = np.polyfit(np.log(gap[late]), period[late], 1)[0]
+    np.testing.assert_allclose(-slope, 2 / float(slow), rtol=1e-3)
+    names = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert names[:3] == ["fast", "again", "stability changes"]
+    assert len({line.get_color() for line in ax.lines}) == 2
+
+
+def test_an_atlas_shows_every_orbit():
+    """Drawn from the file of the paper's pendulum: filled where |kappa| <= 1."""
+    found = dpend.load_atlas("experiments/atlas/brake_orbits.csv")
+    ax = plots.atlas(found)
+    assert sum(len(line.get_xdata()) for line in ax.lines) == len(found)
+    stable = [line for line in ax.lines if line.get_label() in found.table["family"]]
+    calm = np.abs(found.table["kappa"]) <= 1 + 1e-9
+    assert sum(len(line.get_xdata()) for line in stable) == np.sum(calm)
+    assert len(ax.get_legend().get_texts()) == len(found.families)
+
+
+def test_a_map_by_hand_has_a_bar_as_high_as_itself_and_says_what_it_is():
+    side = np.radians(np.linspace(-90, 90, 4))
+    made = xarray.Dataset(
+        {"lyapunov": (("theta1", "theta2"), np.arange(16.0).reshape(4, 4))},
+        {"theta1": side, "theta2": side},
+        {"l1": 0.2, "l2": 0.3, "g": 9.8, "quantity_settings": '[[], {"duration": 2.5}]'},
+    )
+    ax = plots.map_of(made, cmap="magma", vmin=1.0)
+    mesh = ax.collections[0]
+    assert (mesh.get_cmap().name, mesh.norm.vmin) == ("magma", 1.0)
+    assert ax.get_title(loc="left") == "2.5 s, l1 = 0.2 m, l2 = 0.3 m, g = 9.8 m/s$^2$"
+    ax.figure.canvas.draw()
+    heights = [one.get_window_extent().height for one in (ax, ax.child_axes[0])]
+    assert abs(heights[0] - 1.06 * heights[1]) < 0.5  # with the arrows at both ends
 
 
 def test_a_section_shows_the_mirror_of_what_falls_and_its_periodic_points():

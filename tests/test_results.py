@@ -34,6 +34,32 @@ def atlas():
     return dpend.load_atlas(CATALOGUE)
 
 
+def test_a_batch_of_motions_comes_back_from_netcdf(paper, tmp_path):
+    """A status goes up to 255, which no type of NetCDF 3 for one byte holds."""
+    import xarray
+
+    batch = dpend.released(np.array([0.1, 0.2]), np.array([0.2, 0.3]))
+    data = dpend.simulate(paper, batch, times=[0.0, 0.1], tolerance=1e-9).to_xarray()
+    data.to_netcdf(tmp_path / "m.nc", engine="scipy")
+    with xarray.open_dataset(tmp_path / "m.nc", engine="scipy") as back:
+        np.testing.assert_array_equal(back.theta1, data.theta1)
+        assert back.status.attrs["flag_values"].max() == dpend.Status.NOT_COMPUTED == 255
+
+
+def test_a_notebook_shows_a_table(orbits, family, atlas):
+    """The first and last rows under the repr; of what is traced the repr alone."""
+    for result in (orbits, family, atlas):
+        shown = result._repr_html_()
+        assert shown.startswith(f"<p><code>&lt;{type(result).__name__}: ")
+        rows = min(len(result.to_dataframe()), 11)  # ten, and one that stands for the others
+        assert shown.count("<tr") == 1 + rows
+        assert "theta2_deg" in shown
+    told = []
+    jax.jit(lambda one: told.append(one._repr_html_()))(orbits)
+    assert "PeriodicOrbit" in told[0]
+    assert "<table" not in told[0]
+
+
 def test_an_array_of_orbits_is_one(orbits):
     assert len(orbits) == 3
     each = [*orbits]

@@ -19,7 +19,7 @@ from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.orbit import PeriodicOrbit
 from dpend.places import check_place, file_path, replacing
-from dpend.records import Quantities, frame, json_text, outcome, record, span, variables
+from dpend.records import Quantities, frame, html, json_text, outcome, record, span, variables
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,8 @@ class Atlas:
         told = f"{span('period', self.table['period'], 's')}, {outcome(self.table['status'])}"
         suspicious = f"{self.coverage.suspicious_cells} suspicious cells"
         return f"<Atlas: {len(self)} orbits, {families}{told}, {suspicious}>"
+
+    _repr_html_ = html
 
     def to_dataframe(self) -> Any:
         """The table with the names and the units of files: angles in degrees."""

@@ -243,7 +243,10 @@ def run(
     keep = partial(_save_times, times)
     best = _adapt(Field(*constants), begin, end, (tolerance, most_steps), keep, empty)
     # Behind the last state that was saved lie what its step wrote ahead.
-    best = best._replace(rows=jnp.where(jnp.arange(times.size) < best.next, best.rows, jnp.nan))
+    rows = jnp.where(jnp.arange(times.size) < best.next, best.rows, jnp.nan)
+    # A motion of no duration takes no step that could save its beginning.
+    beginning = jnp.append(begin, best.worst)[:, None]
+    best = best._replace(rows=jnp.where((times == 0.0) & jnp.isnan(rows), beginning, rows))
     error = jnp.nan_to_num(best.rows[4], nan=0.0)
     worst = jnp.max(jnp.where(error > best.worst, error, best.worst))
     return _saved(best, worst)

@@ -81,9 +81,10 @@ def follow_family(
             converged; a special point where nothing branches off; longest_period below the period
             of the first orbit.
         RuntimeError: float64 is switched off in JAX.
-    See also: Doedel, Keller and Kernevez, Numerical analysis and control of bifurcation problems
-    (1991); Peeters et
-        al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23 (2009).
+    See also:
+        Doedel, Keller and Kernevez, Numerical analysis and control of bifurcation problems (1991);
+        Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23
+        (2009).
     """
     require_float64()
     fixed = swinging_numbers(pendulum)

@@ -30,7 +30,7 @@ from dpend.orbits.passages import LEVELS, angle_passages, level_passages, onto_l
 from dpend.orbits.samples import SpecialPoint
 from dpend.orbits.special import special_points
 from dpend.orbits.walk import STRAYED
-from dpend.records import Quantities, frame, outcome, span, variables
+from dpend.records import Quantities, frame, html, outcome, span, variables
 from dpend.status import Status, message
 
 # The derivative with respect to theta1 is refused where less than this share of a step along the
@@ -109,6 +109,8 @@ class Family:
         energy = span("energy", self.orbits.energy, "J")
         told = ", ".join((ends, special, period, energy, outcome(self.status)))
         return f"<Family: {count}, {told}>"
+
+    _repr_html_ = html
 
     def at(
         self,

@@ -231,6 +231,9 @@ def find_orbit(
       x(T) = x(0) is solved for, unfolded by one parameter, and solved again with the symmetry that
       it turns out to have. The arguments from `crossing` to `error` are of the other ways.
 
+    Many angles of one branch: `follow_family(pendulum, branch).at(angles)` walks along it once;
+    `vmap` of this walks once an angle, and takes a hundred times as long for fifty.
+
     Negative `theta1` gives the mirror image. Derivatives of every result with respect to `theta1`
     and the pendulum are those of the root itself (implicit function theorem), second ones as
     `jax.hessian` takes them; with `jit`, `vmap` and `grad` all works, and what is wrong with a
@@ -268,10 +271,10 @@ def find_orbit(
             branch, symmetry or ratio; a period not positive; a state without a period or traced by
             `jit`; an argument of another way.
         RuntimeError: float64 is switched off in JAX.
-    See also: Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23
-    (2009): families of
-        normal modes by shooting and arclength; Hristov et al., arXiv:2308.16159: the quarter
-        period.
+    See also:
+        Peeters et al., Nonlinear normal modes II, Mechanical Systems and Signal Processing 23
+        (2009): families of normal modes by shooting and arclength; Hristov et al.,
+        arXiv:2308.16159: the quarter period.
     """
     require_float64()
     if state is not None or period is not None:

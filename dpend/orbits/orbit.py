@@ -27,7 +27,7 @@ from dpend.orbits.implicit import (
 from dpend.orbits.newton import Solved
 from dpend.orbits.path import unfold
 from dpend.orbits.stability import OPPOSITE, stability_class
-from dpend.records import Quantities, frame, outcome, quantities, span, variables
+from dpend.records import Quantities, frame, html, outcome, quantities, span, variables
 from dpend.status import Status
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -174,6 +174,8 @@ class PeriodicOrbit:
         angles = (span(name, getattr(self, name), "rad") for name in ("theta1", "theta2"))
         told = ", ".join((*angles, span("period", self.period, "s"), span("kappa", self.kappa)))
         return f"<PeriodicOrbit: {many}{self.symmetry}, {told}, {outcome(self.status)}>"
+
+    _repr_html_ = html
 
 
 def orbit_quantities(orbits: PeriodicOrbit) -> Quantities:

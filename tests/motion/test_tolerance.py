@@ -156,6 +156,17 @@ def test_small_swings_are_as_right_as_large_ones(paper, amplitude):
     assert np.max(np.abs(motion.state.theta1 - swing)) < bound
 
 
+def test_a_motion_of_no_duration_is_its_beginning(paper):
+    """Found by an orbit asked for at half its period alone, where a piece begins: it was NaN."""
+    release = dpend.released(0.5, 0.2)
+    motion = dpend.simulate(paper, release, times=[0.0], tolerance=1e-9)
+    assert float(motion.state.theta1[0]) == 0.5
+    assert 0 < float(motion.error[0]) < 1e-14
+    orbit = dpend.find_orbit(paper, np.radians(40), branch="anti-phase")
+    half = orbit.trajectory([float(orbit.period) / 2]).state
+    np.testing.assert_allclose(half.theta2, -orbit.theta2, rtol=1e-12)
+
+
 def test_an_estimate_grows_with_the_motion(paper):
     """The start counts as exact and the sums are compensated: what errors grow from is less than a
     rounding of the start, and not a hundred times.
