@@ -108,7 +108,7 @@ class Store:
     def inspect(self) -> "Findings":
         """Every file beside what it should be, one tile at a time."""
         stale = self._find_stale()
-        tiles = {tile: self._tile_problems(tile) for tile in self.tiles}
+        tiles = {tile: self.tile_problems(tile) for tile in self.tiles}
         todo = [tile for tile in self.tiles if tiles[tile]]
         # Tiles are computed in order: one that was never done has no digest, and none after it has.
         done = sum(1 for _ in itertools.dropwhile(tiles.get, reversed(self.tiles)))
@@ -141,7 +141,7 @@ class Store:
             return str(error)
         return "" if found == text else "has other bytes"
 
-    def _tile_problems(self, tile: tuple[int, ...]) -> dict[str, str]:
+    def tile_problems(self, tile: tuple[int, ...]) -> dict[str, str]:
         """What is wrong with a tile's files, by name; nothing with one that is done."""
         digest = self._digest_name(tile)
         try:
