@@ -213,7 +213,9 @@ def compute_in_store(
         if client is None:
             _fill(work, store, todo)
         else:
+            store.mark(unordered=True)
             fill_by_workers(work, store, todo, client)
+        store.mark(unordered=False)
     return store.open()
 
 
