@@ -90,7 +90,7 @@ def connect(workers: int | None, address: str | None) -> Iterator[Any]:
     distributed = import_distributed()
     if address is not None:
         try:
-            client = distributed.Client(address, timeout=_ANSWER)
+            client = distributed.Client(address, timeout=_ANSWER, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise ValueError(
                 f"cluster must be the address of a Dask scheduler, got {address} "
@@ -107,7 +107,7 @@ def connect(workers: int | None, address: str | None) -> Iterator[Any]:
         dashboard_address=None,
         silence_logs="CRITICAL",
     )
-    with cluster, distributed.Client(cluster) as client:
+    with cluster, distributed.Client(cluster, set_as_default=False) as client:
         yield client
 
 

@@ -114,7 +114,7 @@ class Store:
         todo = [tile for tile in self.tiles if tiles[tile]]
         # Tiles are computed in order: one that was never done has no digest, and none after it has.
         # Of tiles written in any order, no digest tells nothing.
-        unordered = os.path.isfile(self.path / _LOCK) and os.path.getsize(self.path / _LOCK) > 0
+        unordered = self._is_unordered()
         done = sum(1 for _ in itertools.dropwhile(tiles.get, reversed(self.tiles)))
         before = set() if unordered else set(self.tiles[:done])
         fresh = {tile for tile in todo if tiles[tile].get(self._digest_name(tile)) == MISSING}
@@ -122,6 +122,9 @@ class Store:
         damage = stale | {name: why for tile in again for name, why in tiles[tile].items()}
         leftovers = list(self.path.glob("*.partial"))
         return Findings(stale, todo, again, damage, leftovers, unordered)
+
+    def _is_unordered(self) -> bool:
+        return os.path.isfile(self.path / _LOCK) and os.path.getsize(self.path / _LOCK) > 0
 
     def _find_stale(self) -> dict[str, str]:
         """Metadata and coordinates that are not as they should be, and why."""

@@ -60,7 +60,7 @@ def client():
     quiet = {"processes": False, "dashboard_address": None, "memory_limit": 0}
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, **quiet) as here,
-        Client(here) as client,
+        Client(here, set_as_default=False) as client,
     ):
         yield client
 
