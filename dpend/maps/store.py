@@ -116,7 +116,7 @@ class Store:
         # Of tiles written in any order, no digest tells nothing.
         unordered = self._is_unordered()
         done = sum(1 for _ in itertools.dropwhile(tiles.get, reversed(self.tiles)))
-        before = set() if unordered else set(self.tiles[:done])
+        before = set(self.tiles[: done * (not unordered)])
         fresh = {tile for tile in todo if tiles[tile].get(self._digest_name(tile)) == MISSING}
         again = [tile for tile in todo if tile in before or tile not in fresh]
         damage = stale | {name: why for tile in again for name, why in tiles[tile].items()}
