@@ -90,15 +90,19 @@ def _surroundings() -> tuple:
     """All that a program's code depends on besides its arguments."""
     house = Path(__file__).parent
     sources = b"".join(path.read_bytes() for path in sorted(house.rglob("*.py")))
-    processor = platform.processor()
-    with contextlib.suppress(OSError):
-        text = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
-        processor = "".join(line for line in text if line.startswith(("model", "flags", "Feat")))
     settings = sorted((key, repr(value)) for key, value in jax.config.values.items())
     settings = [pair for pair in settings if "cache" not in pair[0]]
     flags = [os.environ.get(name, "") for name in ("XLA_FLAGS", "DPEND_PLAIN_JAX")]
     versions = jax.__version__, jaxlib.__version__, sys.version, platform.platform()
-    return (_digest(sources), versions, processor, settings, flags, jax.device_count())
+    return (_digest(sources), versions, processor(), settings, flags, jax.device_count())
+
+
+def processor() -> str:
+    """The processor's model and abilities, on which compiled code depends."""
+    with contextlib.suppress(OSError):
+        text = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+        return "".join(line for line in text if line.startswith(("model", "flags", "Feat")))
+    return platform.processor()
 
 
 def _digest(data: bytes) -> str:

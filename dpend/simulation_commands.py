@@ -15,6 +15,7 @@ import typer
 
 import dpend
 from dpend.checks import number
+from dpend.maps.cluster import connect
 from dpend.maps.cost import Cost
 from dpend.maps.store import check_store
 from dpend.mechanics.pendulum import Pendulum
@@ -147,6 +148,13 @@ def map_command(
             help="Refuse a map of more steps, or a motion of more than a millionth of it.",
         ),
     ] = 1e12,
+    workers: Annotated[
+        int | None, counted("Compute by so many processes of Dask on this machine.")
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(help="Compute on the Dask cluster at this address, as tcp://host:8786."),
+    ] = None,
     figure: Annotated[Path | None, typer.Option(help="Draw the map into P.png.")] = None,
 ) -> Report:
     """A map of the square of releases from rest: chaos, first flips or energy drift, cell by
@@ -162,7 +170,11 @@ def map_command(
     check_store("out", out)
     check_figure(figure)
     started, counts = time.perf_counter(), [0, 0, 0]
-    with complaints_of_stores(), bar(on_terminal(), "cells") as show:
+    with (
+        complaints_of_stores(),
+        connect(workers, cluster) as client,
+        bar(on_terminal(), "cells") as show,
+    ):
 
         def tell(*now: int) -> None:
             counts[:] = now
@@ -180,6 +192,7 @@ def map_command(
             progress=tell,
             announce=_announce,
             most_steps=most_steps,
+            client=client,
         )
     record = _map_record(field, time.perf_counter() - started, counts[2], out)
     if figure is not None:

@@ -43,6 +43,27 @@ def read_json(path: Path) -> Any:
         raise ValueError("is no JSON") from None
 
 
+def read_attributes(name: str, path: Path) -> dict[str, Any]:
+    """The attributes of a sweep's store.
+
+    Raises:
+        ValueError: there is none. `name` is the argument that is told.
+    """
+    try:
+        document = read_json(path / "zarr.json")
+        problem = "is no description of a sweep"
+    except ValueError as error:
+        document, problem = None, str(error)
+    found = document.get("attributes") if isinstance(document, dict) else None
+    if not isinstance(found, dict) or not isinstance(found.get("dpend_version"), str):
+        raise ValueError(
+            f"{name} must be a Zarr store of a sweep or a new name, got {path}: its zarr.json "
+            f"{problem}; "
+            "give another name"
+        )
+    return found
+
+
 def canonical(value: Any) -> str:
     """A text that is the same for JSON values of the same content and types only."""
     return json.dumps(value, sort_keys=True)

@@ -8,7 +8,8 @@ devices. On any other backend the same call is one `jax.vmap`.
 
 A launch is a fixed number of blocks, of which only as many run as there are lanes for, so that one
 compiled program serves any number of lanes, and every lane's bits are the same whatever number of
-lanes, launches or devices there are.
+lanes, launches or devices there are. (Devices from two on: for one alone XLA compiles another
+program, of which the last bits may differ.)
 """
 
 import math

@@ -21,10 +21,12 @@ from typing import Any
 
 import numpy as np
 
+from dpend.maps import disk
 from dpend.maps.disk import MISSING, canonical, clear, make_way, put, read, read_json, remove, sync
 from dpend.places import unwritable
 
 # Where the digests of tiles and the lock lie: inside an array, where Zarr's readers do not look.
+# The lock is empty, but while tiles are written in any order.
 _DIGESTS, _LOCK = "status/sha256", "status/lock"
 # How many damaged files a warning names.
 _NAMED = 3
@@ -82,7 +84,7 @@ class Store:
                 sweep.
             RuntimeError: another version of this package made it.
         """
-        found = _attributes("store", self.path)
+        found = disk.read_attributes("store", self.path)
         ours = self.attributes["dpend_version"]
         if found["dpend_version"] != ours:
             raise RuntimeError(
@@ -108,15 +110,21 @@ class Store:
     def inspect(self) -> "Findings":
         """Every file beside what it should be, one tile at a time."""
         stale = self._find_stale()
-        tiles = {tile: self._tile_problems(tile) for tile in self.tiles}
+        tiles = {tile: self.tile_problems(tile) for tile in self.tiles}
         todo = [tile for tile in self.tiles if tiles[tile]]
         # Tiles are computed in order: one that was never done has no digest, and none after it has.
+        # Of tiles written in any order, no digest tells nothing.
+        unordered = self._is_unordered()
         done = sum(1 for _ in itertools.dropwhile(tiles.get, reversed(self.tiles)))
-        before = set(self.tiles[:done])
+        before = set(self.tiles[: done * (not unordered)])
         fresh = {tile for tile in todo if tiles[tile].get(self._digest_name(tile)) == MISSING}
         again = [tile for tile in todo if tile in before or tile not in fresh]
         damage = stale | {name: why for tile in again for name, why in tiles[tile].items()}
-        return Findings(stale, todo, again, damage, list(self.path.glob("*.partial")))
+        leftovers = list(self.path.glob("*.partial"))
+        return Findings(stale, todo, again, damage, leftovers, unordered)
+
+    def _is_unordered(self) -> bool:
+        return os.path.isfile(self.path / _LOCK) and os.path.getsize(self.path / _LOCK) > 0
 
     def _find_stale(self) -> dict[str, str]:
         """Metadata and coordinates that are not as they should be, and why."""
@@ -141,7 +149,7 @@ class Store:
             return str(error)
         return "" if found == text else "has other bytes"
 
-    def _tile_problems(self, tile: tuple[int, ...]) -> dict[str, str]:
+    def tile_problems(self, tile: tuple[int, ...]) -> dict[str, str]:
         """What is wrong with a tile's files, by name; nothing with one that is done."""
         digest = self._digest_name(tile)
         try:
@@ -222,6 +230,13 @@ class Store:
         put(self.path, name, text)
         return self._line(name, text)
 
+    def mark(self, unordered: bool) -> None:
+        """Says in the lock, which must be held, whether tiles are being written in any order."""
+        try:
+            (self.path / _LOCK).write_bytes(b"unordered" if unordered else b"")
+        except OSError as error:
+            raise self._unwritable(error) from None
+
     def array(self, key: str) -> Any:
         """An array of the store, to be read."""
         import zarr
@@ -291,6 +306,7 @@ class Findings:
         again: the tiles among them that were done once.
         damage: files that were once whole, by name, and why they are not.
         leftovers: of a process that was killed.
+        unordered: tiles were being written in any order.
     """
 
     stale: dict[str, str]
@@ -298,10 +314,11 @@ class Findings:
     again: list[tuple[int, ...]]
     damage: dict[str, str]
     leftovers: list[Path]
+    unordered: bool
 
     @property
     def whole(self) -> bool:
-        return not (self.stale or self.todo or self.leftovers)
+        return not (self.stale or self.todo or self.leftovers or self.unordered)
 
     def sentence(self, store: Store) -> str:
         """The damage in one line."""
@@ -323,27 +340,10 @@ def check_store(name: str, path: Path) -> None:
             that is told.
     """
     if os.path.lexists(path):
-        _attributes(name, path)
+        disk.read_attributes(name, path)
     elif reason := unwritable(path):
         raise ValueError(
             f"{name} must be a new name in a directory that can be written to, got {path} "
             f"({reason}): "
             "give another place"
         )
-
-
-def _attributes(name: str, path: Path) -> dict[str, Any]:
-    """A store's attributes; raises as `check_store` does."""
-    try:
-        document = read_json(path / "zarr.json")
-        problem = "is no description of a sweep"
-    except ValueError as error:
-        document, problem = None, str(error)
-    found = document.get("attributes") if isinstance(document, dict) else None
-    if not isinstance(found, dict) or not isinstance(found.get("dpend_version"), str):
-        raise ValueError(
-            f"{name} must be a Zarr store of a sweep or a new name, got {path}: its zarr.json "
-            f"{problem}; "
-            "give another name"
-        )
-    return found

@@ -2,7 +2,6 @@
 resumed.
 """
 
-import math
 import os
 import warnings
 from collections.abc import Callable, Mapping
@@ -14,11 +13,12 @@ import numpy as np
 
 from dpend._runtime import require_float64
 from dpend.checks import flag, function, known_number, shown, text
+from dpend.maps.cluster import check_client, fill_by_workers
 from dpend.maps.cost import COUNTABLE, MOST_SWEEP_STEPS, Cost
 from dpend.maps.grid import PENDULUM, Grid, Keyed, Quantity, Task, coordinates_of, units_of
 from dpend.maps.layout import store_of
 from dpend.maps.store import Store, StoreWarning, check_store
-from dpend.maps.tiles import Work, find_parities, whole_tile
+from dpend.maps.tiles import Work, cells_of, find_parities, whole_tile
 from dpend.mechanics.pendulum import Pendulum
 from dpend.methods.scheme import Scheme, scheme_for
 from dpend.places import file_path
@@ -44,6 +44,7 @@ def sweep(
     progress: Callable[[int, int, int], None] | Any | None = None,
     announce: Callable[["Cost"], None] | Any | None = None,
     most_steps: float | Any = MOST_SWEEP_STEPS,
+    client: Any | None = None,
 ) -> Any:
     """A quantity over one or two fields of `State` or `Pendulum`.
 
@@ -70,11 +71,15 @@ def sweep(
             what is returned is opened lazily.
         name: of the quantity in the store, needed where it is a lambda or a closure.
         progress: called with cells done, cells in all, and steps taken by this call, after every
-            piece of work.
+            piece of work. An exception that it raises stops the sweep and is passed on; tiles that
+            are done stay in the store.
         announce: called with the `Cost` of what is to be computed, before it is.
         most_steps: refuse what would take more steps in all, or more than a millionth of it in one
             motion, because these follow one another. The steps are known from the quantity's
             setting `duration`; of a quantity without one the first cells tell.
+        client: a `dask.distributed.Client`: its workers compute the tiles and write them into the
+            store, with the bytes that this process would write. They must see the store's directory
+            by the same path. `progress` is then called after every tile, and twice a second.
     Returns:
         xarray.Dataset: the quantity's values, `status` (a value of `Status` for each cell:
         NONFINITE where a value is NaN), coordinates with units, angles also in degrees, and as
@@ -82,9 +87,9 @@ def sweep(
     Raises:
         ValueError: bad axes, tolerance or method; a store made with other settings, or a directory
             that is none; a store that another process is writing, or that cannot be written; more
-            than `most_steps`, or than the memory holds.
+            than `most_steps`, or than the memory holds; a client without a store.
         RuntimeError: a store made by another version of this package; float64 is switched off in
-            JAX.
+            JAX; workers of other versions, or lost for good; `distributed` is not installed.
     """
     require_float64()
     example = "functools.partial(dpend.chaos.lyapunov, duration=10.0)"
@@ -100,15 +105,21 @@ def sweep(
     mirror = flag("mirror", mirror)
     place = None if store is None else file_path("store", store)
     name = None if name is None else text("name", name)
-    if progress is not None:
-        function("progress", progress, "(cells done, cells in all, steps)", "print")
-    if announce is not None:
-        function("announce", announce, "a Cost", "print")
+    _check_listeners(progress, announce)
+    if client is not None:
+        check_client(client, place)
     work = Work(Task(keyed, grid, scheme, error is not None, mirror), most)
     work.tell, work.announce = progress, announce
     if place is None:
         return _label(work.task, compute(work), work.task.attributes(name, strict=False))
-    return compute_in_store(work, place, work.task.attributes(name, strict=True))
+    return compute_in_store(work, place, work.task.attributes(name, strict=True), client)
+
+
+def _check_listeners(progress: Any, announce: Any) -> None:
+    if progress is not None:
+        function("progress", progress, "(cells done, cells in all, steps)", "print")
+    if announce is not None:
+        function("announce", announce, "a Cost", "print")
 
 
 def _scheme(grid: Grid, tolerance: Any, method: Any, step: Any) -> Scheme:
@@ -178,7 +189,9 @@ def _label(task: Task, values: dict[str, np.ndarray], attributes: dict[str, Any]
     return xarray.Dataset(data, coordinates_of(task.grid), attributes)
 
 
-def compute_in_store(work: Work, path: Path, attributes: dict[str, Any]) -> Any:
+def compute_in_store(
+    work: Work, path: Path, attributes: dict[str, Any], client: Any | None = None
+) -> Any:
     check_store("store", path)
     store, grid = store_of(work, path, attributes), work.task.grid
     blocks = dict(zip(store.tiles, grid.tiles(), strict=True))
@@ -194,15 +207,16 @@ def compute_in_store(work: Work, path: Path, attributes: dict[str, Any]) -> Any:
         if findings.damage:
             warnings.warn(findings.sentence(store), StoreWarning, stacklevel=3)
         todo = {tile: blocks[tile] for tile in findings.todo}
-        done = work.all - sum(_size(block) for block in todo.values())
+        done = work.all - sum(cells_of(block) for block in todo.values())
         work.begin(done)
         store.repair(findings)
-        _fill(work, store, todo)
+        if client is None:
+            _fill(work, store, todo)
+        else:
+            store.mark(unordered=True)
+            fill_by_workers(work, store, todo, client)
+        store.mark(unordered=False)
     return store.open()
-
-
-def _size(block: tuple[slice, ...]) -> int:
-    return math.prod(part.stop - part.start for part in block)
 
 
 def _fill(work: Work, store: Store, todo: dict[tuple[int, ...], tuple[slice, ...]]) -> None:

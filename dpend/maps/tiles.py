@@ -183,6 +183,11 @@ def _pieces(work: "Work", lanes: dict[str, np.ndarray]) -> Iterator[dict[str, np
             yield from launches(task.cell, task.shared, some, work.cost.each or 1.0)
 
 
+def cells_of(block: tuple[slice, ...]) -> int:
+    """How many cells a block has."""
+    return math.prod(part.stop - part.start for part in block)
+
+
 def whole_tile(
     work: Work,
     block: tuple[slice, ...],
