@@ -57,7 +57,8 @@ def _rows(n: int, x: Fraction) -> tuple[list[Fraction], list[Fraction]]:
 def values_matrix(n: int) -> tuple[Any, Any]:
     """T_j and T_j' at `nodes`, shape (n, n) each: exact numbers rounded once."""
     rows = [_rows(n, Fraction(float(x))) for x in nodes(n)]
-    return tuple(np.array([[float(x) for x in row[i]] for row in rows]) for i in (0, 1))
+    values, slopes = (np.array([[float(x) for x in row[i]] for row in rows]) for i in (0, 1))
+    return values, slopes
 
 
 @functools.lru_cache

@@ -6,8 +6,8 @@ the sum of its other |c_jk| and its error. Five are tried: p, q, the direction o
 middle, and the two that the linear parts make nearly s and z alone. At the time 0 all p vanish; on
 the first step the same is asked of the rates p', q', because then u p + v q grows with time.
 
-What is not empty is cut into four, and so on, until it is empty, lies where an orbit is proved to
-be the only one, or is smaller than `SMALLEST` and left open.
+What is not empty is cut into two, and so on, until it is empty, lies where an orbit is proved to be
+the only one, or the momenta vary over it by less than their errors, and it is left open.
 """
 
 from typing import Any, NamedTuple
@@ -19,9 +19,8 @@ from dpend.proofs.balls import TINY, UNIT, gamma
 from dpend.proofs.lanes import UP
 from dpend.proofs.sheet import ANGLES, TIMES, Step
 
-# Half width [rad] of cells that are cut no further, and how many are open at once at most. The
-# boxes of uniqueness are some 1e-5 wide.
-SMALLEST, MOST_CELLS = 2.0**-30, 100_000
+# More cells than this at once stay open: a proof needs a few a box.
+MOST_CELLS = 100_000
 # Covers the rounding of distances of angles, full turns taken off, of some hundred radians.
 ROUNDING = 1e-12
 
@@ -50,20 +49,24 @@ class Cells(NamedTuple):
         columns = [x + sign * r for x, r in sides for sign in (-1, 1)]
         return list(zip(*(column.tolist() for column in columns), strict=True))
 
-    def quarters(self) -> "Cells":
-        """Each cut into four."""
-        error = self.error
-        early, late = chebyshev.halves(TIMES)
-        low, high = chebyshev.halves(ANGLES)
-        rounding = chebyshev.halving_error(TIMES) * float(np.abs(low).sum(0).max())
-        rounding += chebyshev.halving_error(ANGLES) * float(np.abs(early).sum(0).max()) * UP
-        error = (error + 2 * rounding * chebyshev.total(self.series)) * UP
+    def halves(self) -> "Cells":
+        """Each cut into two, across time or across theta2, whichever the momenta vary more with."""
+        sizes = np.abs(self.series)
+        by_time = sizes[:, :, 1:].sum((0, 2, 3)) > sizes[:, :, 0, 1:].sum((0, 2))
         parts = []
-        for in_time, shift in ((early, -0.5), (late, 0.5)):
-            for in_angle, side in ((low, -0.5), (high, 0.5)):
-                series = in_time @ self.series @ in_angle.T
-                middle, time = self.middle + side * self.half, self.time + shift * self.span
-                parts.append(Cells(middle, self.half / 2, time, self.span / 2, series, error))
+        for in_time, keep in ((True, by_time), (False, ~by_time)):
+            cells, count = self.take(keep), TIMES if in_time else ANGLES
+            rounding = chebyshev.halving_error(count) * chebyshev.total(cells.series)
+            error = (cells.error + rounding) * UP
+            for half, side in zip(chebyshev.halves(count), (-0.5, 0.5), strict=True):
+                middle, r, time, span = cells[:4]
+                if in_time:
+                    place = middle, r, time + side * span, span / 2
+                    series = half @ cells.series
+                else:
+                    place = middle + side * r, r / 2, time, span
+                    series = cells.series @ half.T
+                parts.append(Cells(*place, series, error))
         return join(parts)
 
 
@@ -149,9 +152,9 @@ def sift(cells: Cells, known: Known, end: float) -> tuple[Cells, int]:
         cells = cells.take(~empty(cells))
         early = cells.time - cells.span <= end
         cells = cells.take(early & ~known.holds(cells))
-        small = (cells.half < SMALLEST) | (len(cells.middle) > MOST_CELLS)
         # A cell over which the momenta change by less than their errors stays open for ever.
-        small |= (chebyshev.beside_first(cells.series) < cells.error).all(0)
+        small = (chebyshev.beside_first(cells.series) < cells.error).all(0)
+        small |= len(cells.middle) > MOST_CELLS
         open_cells.append(cells.take(small))
-        cells = cells.take(~small).quarters()
+        cells = cells.take(~small).halves()
     return join([*open_cells, cells]), looked

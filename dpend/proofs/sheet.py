@@ -56,8 +56,6 @@ ORDER, SHARE = 24, 0.15
 TIME_RADII, ANGLE_RADII = (4.0, 6.0, 8.0, 11.0, 15.0), (4.0, 6.0, 9.0, 14.0, 21.0, 32.0, 50.0, 90.0)
 # A defect larger than this is made smaller by halving the box or the step.
 DEFECT = 1e-13
-# How often a step is halved for its growth.
-CUTS = 2
 # epsilon that is tried, over what is known before the growth is.
 TUBE = 4.0
 # Steps are multiples of this, so that times are sums without rounding.
@@ -111,10 +109,11 @@ class Sheet:
 
     Arguments:
         exact: the coefficients as balls; floats: the same as float64 numbers.
+        cuts: how often a step is halved for its growth: the finer, the less is overestimated.
     """
 
-    def __init__(self, exact: Coefficients, floats: Ratios) -> None:
-        self.floats = floats
+    def __init__(self, exact: Coefficients, floats: Ratios, cuts: int = 2) -> None:
+        self.floats, self.cuts = floats, cuts
         pairs = zip(exact, floats, strict=True)
         self.lanes: Any = Coefficients(
             *(Lanes(np.full((1, 1), x), np.full((1, 1), upper(ball - x))) for ball, x in pairs)
@@ -132,7 +131,7 @@ class Sheet:
         return error / self.scale[:, None] * UP
 
     def propose(self, front: Front) -> tuple[Any, Any]:
-        """w and P, in float64: steps of `SHARE` of the radius of convergence, `front.longest` at most."""
+        """w and P, in float64: no step is longer than `front.longest`."""
         boxes, count = front.edge.shape[1:]
         fit, table = chebyshev.fit_matrix(count), chebyshev.values_matrix(count)[0]
         start = np.einsum("klj,ij->lik", front.edge, table).reshape(-1, 4)
@@ -215,25 +214,21 @@ class Sheet:
         sizes = np.abs(series)
         sizes[..., 0, 0] = 0
         centre = series[..., 0, 0]
-        # |T_j'| <= j^2 |T_j| bounds on both kinds of sets; see `derivative`.
         for rho in radii:
             count = TIMES if in_time else ANGLES
             weight = chebyshev.weights(count, rho)
             grown = sizes * (weight[:, None] if in_time else weight)
             spread = grown.sum((-2, -1)) * (1 + gamma(TIMES * ANGLES + 4))
             state = [Lanes(c[:, None], r[:, None]) for c, r in zip(centre, spread, strict=True)]
-            slope = self._slope_bound(grown, in_time)
+            slope = _slope_bound(grown)
             bound = np.stack(
                 [(v * w).bound() + x for v, x in zip(field(self.lanes, state), slope, strict=True)]
             )
-            # Beyond 60 degrees of spread the field is known to nothing, and comes out infinite.
-            best = np.minimum(best, np.where(np.isnan(bound), np.inf, bound) * chebyshev.tail(count, rho))
+            # Too wide a spread bounds nothing, and comes out infinite or as no number.
+            best = np.minimum(
+                best, np.where(np.isnan(bound), np.inf, bound) * chebyshev.tail(count, rho)
+            )
         return best * UP
-
-    def _slope_bound(self, grown: Any, in_time: bool) -> Any:
-        """Bounds |P'| where |T_j| is bounded by the weights in `grown`."""
-        j = np.arange(TIMES, dtype=float)[:, None]
-        return (grown * j * j).sum((-2, -1)) * (1 + gamma(TIMES * ANGLES + 4))
 
     def start(self, front: Front, series: Any) -> Any:
         """|e|_S at s = -1, shape (L,)."""
@@ -247,7 +242,7 @@ class Sheet:
     def growth(self, series: Any, tube: Any) -> tuple[Any, Any]:
         """Bounds of the mean over s of m, not negative, and of |S J S^-1|_2; shape (L,) each."""
         pieces, off = [series], np.zeros(series.shape[:2])
-        for _ in range(CUTS):
+        for _ in range(self.cuts):
             off = (off + chebyshev.halving_error(TIMES) * chebyshev.total(pieces[0])) * UP
             pieces = [half @ piece for piece in pieces for half in chebyshev.halves(TIMES)]
         # The pieces' errors are about those of the first: |T_j| <= 1 on all of them.
@@ -290,3 +285,13 @@ def eigenvalue_above(matrix: Any) -> Any:
     skew = np.abs(t @ q - np.eye(k)) + gamma(k + 4) * (size.transpose(0, 2, 1) @ size + 1)
     skew = skew.sum(-1).max(-1) * UP
     return np.where(fine & (skew < 0.5), largest / (1 - skew) * UP, np.inf)
+
+
+def _slope_bound(grown: Any) -> Any:
+    """Bounds |P'| where |T_j| is bounded by the weights in `grown`.
+
+    T_j' = j (z^(j-1) + z^(j-3) + ... + z^(1-j)) with s = (z + 1/z)/2: on the ellipse |z| = rho
+    it is at most j^2 times the bound of T_j, and on [-1, 1] at most j^2.
+    """
+    j = np.arange(TIMES, dtype=float)[:, None]
+    return (grown * j * j).sum((-2, -1)) * (1 + gamma(TIMES * ANGLES + 4))
