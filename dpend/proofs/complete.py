@@ -8,6 +8,8 @@ longest period is proved to hold no rest (`march`). What is not is listed.
 Why it is complete: a brake orbit with a period of at most `max_period` has a rest at T/2, which is
 in a cell. No cell that is proved empty holds it, hence it is in a square, hence it is the rest that
 belongs to the square, and the orbit is one of those proved, run through once or several times.
+Every periodic motion from rest is a brake orbit: it is at T/2 what it is at -T/2, which is the same
+place with the velocities turned round.
 
 It assumes what a `Certificate` assumes, and that NumPy's float64 quotients and square roots are
 rounded to nearest.
@@ -23,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from dpend.catalogue.atlas import Atlas
-from dpend.catalogue.release import find_brake_orbits
+from dpend.catalogue.release import check_period, find_brake_orbits
 from dpend.checks import at_most_one, function, known_number
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.find import swinging_pendulum
@@ -102,17 +104,16 @@ class BrakeProof:
         unit = "deg" if self.release.unit == "deg" else "rad (the float64 number)"
         values = zip(("l1", "l2", "m1", "m2", "g"), self.pendulum, strict=True)
         where = (
-            f"released from rest at theta1 = {self.release.text} {unit}, a pendulum with exactly "
-            f"{', '.join(f'{name} = {x}' for name, x in values)} (SI units)"
+            f"{number} values of theta2, up to full turns, from which a pendulum with exactly "
+            f"{', '.join(f'{name} = {x}' for name, x in values)} (SI units), released from rest at "
+            f"theta1 = {self.release.text} {unit}, moves periodically with a period of at most "
+            f"{self.max_period} s."
         )
         if self.complete:
-            return (
-                f"Proved: {where} has exactly {number} periodic orbits that rest again and whose "
-                f"period is at most {self.max_period} s."
-            )
+            return f"Proved: there are exactly {where}"
         lines = [
-            f"Not decided: {where} has at least {number} periodic orbits that rest again and whose "
-            f"period is at most {self.max_period} s. {len(self.undecided)} places are open:"
+            f"Proved: there are at least {where} Not decided: whether there are more. "
+            f"{len(self.undecided)} places are open:"
         ]
         for one in self.undecided[:MOST_IN_WORDS]:
             (low, high), (early, late) = one.theta2_deg, one.period
@@ -185,16 +186,18 @@ def prove_brake_orbits(
         max_period: [s]. The time it takes grows exponentially with it.
         progress: called with the area of (theta2, t) that is done, and with all of it.
     Returns:
-        BrakeProof; what is not proved is in its `undecided`, no exception.
+        BrakeProof; what is not proved is in its `undecided`, no exception. Where theta1 is 0 or 180
+        degrees the neighbourhoods of the equilibria stay undecided.
     Raises:
         ValueError: not exactly one of theta1 and theta1_deg; otherwise as `find_brake_orbits`.
         RuntimeError: python-flint is missing; float64 is switched off in JAX.
     """
-    require_flint()
-    if progress is not None:
-        function("progress", progress, "(area done, area in all)", "print")
     fixed = swinging_pendulum(pendulum)
     release, angle = _release(theta1, theta1_deg)
+    check_period(fixed, max_period)
+    if progress is not None:
+        function("progress", progress, "(area done, area in all)", "print")
+    require_flint()
     wall, cpu = time.perf_counter(), time.process_time()
     atlas = find_brake_orbits(fixed, theta1=angle, max_period=max_period)
     text = shortest(float(atlas.max_period))

@@ -117,7 +117,7 @@ def arrive(sheet: Sheet, step: Step) -> Front:
     """The front at the end of a step."""
     first, later = step.series[:, :, 0], step.series[:, :, 1:]
     edge = first + later.sum(2)
-    rounding = gamma(TIMES) * np.abs(later).sum((2, 3)) + 2 * UNIT * np.abs(edge).sum(-1)
+    rounding = gamma(TIMES + 4) * np.abs(later).sum((2, 3)) + 2 * UNIT * np.abs(edge).sum(-1)
     error = (step.error + sheet.norm(rounding * UP)) * UP
     start, time = step.start, step.start.time + 2 * step.half
     return Front(start.middle, start.half, time, edge, error, np.full(len(time), np.inf))

@@ -21,7 +21,7 @@ from dpend.proofs.sheet import ANGLES, TIMES, Step
 
 # More cells than this at once stay open: a proof needs a few a box.
 MOST_CELLS = 100_000
-# Covers the rounding of distances of angles, full turns taken off, of some hundred radians.
+# Covers the rounding of times, and of distances of angles, full turns taken off.
 ROUNDING = 1e-12
 
 
@@ -150,7 +150,7 @@ def sift(cells: Cells, known: Known, end: float) -> tuple[Cells, int]:
     while len(cells.middle):
         looked += len(cells.middle)
         cells = cells.take(~empty(cells))
-        early = cells.time - cells.span <= end
+        early = cells.time - cells.span <= end + ROUNDING
         cells = cells.take(early & ~known.holds(cells))
         # A cell over which the momenta change by less than their errors stays open for ever.
         small = (chebyshev.beside_first(cells.series) < cells.error).all(0)

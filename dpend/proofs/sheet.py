@@ -241,12 +241,11 @@ class Sheet:
 
     def growth(self, series: Any, tube: Any) -> tuple[Any, Any]:
         """Bounds of the mean over s of m, not negative, and of |S J S^-1|_2; shape (L,) each."""
-        pieces, off = [series], np.zeros(series.shape[:2])
+        pieces, extra = [series], self.components(tube)
         for _ in range(self.cuts):
-            off = (off + chebyshev.halving_error(TIMES) * chebyshev.total(pieces[0])) * UP
+            largest = np.max([chebyshev.total(piece) for piece in pieces], 0)
+            extra = (extra + chebyshev.halving_error(TIMES) * largest) * UP
             pieces = [half @ piece for piece in pieces for half in chebyshev.halves(TIMES)]
-        # The pieces' errors are about those of the first: |T_j| <= 1 on all of them.
-        extra = off * 4 + self.components(tube)
         found = [self._growth(piece, extra) for piece in pieces]
         mean = sum(x for x, _ in found) / len(found) * UP
         return mean, np.max([x for _, x in found], 0)
