@@ -101,18 +101,20 @@ class BrakeProof:
     def statement(self) -> str:
         """What is proved, in words."""
         number = sum(one.exists for one in self.certificates)
+        verb = "is" if number == 1 else "are"
         unit = "deg" if self.release.unit == "deg" else "rad (the float64 number)"
         values = zip(("l1", "l2", "m1", "m2", "g"), self.pendulum, strict=True)
         where = (
-            f"{number} values of theta2, up to full turns, from which a pendulum with exactly "
+            f"{number} value{'s' * (number != 1)} of theta2, up to full turns, from which a "
+            "pendulum with exactly "
             f"{', '.join(f'{name} = {x}' for name, x in values)} (SI units), released from rest at "
             f"theta1 = {self.release.text} {unit}, moves periodically with a period of at most "
             f"{self.max_period} s."
         )
         if self.complete:
-            return f"Proved: there are exactly {where}"
+            return f"Proved: there {verb} exactly {where}"
         lines = [
-            f"Proved: there are at least {where} Not decided: whether there are more. "
+            f"Proved: there {verb} at least {where} Not decided: whether there are more. "
             f"{len(self.undecided)} places are open:"
         ]
         for one in self.undecided[:MOST_IN_WORDS]:
@@ -187,7 +189,7 @@ def prove_brake_orbits(
         progress: called with the area of (theta2, t) that is done, and with all of it.
     Returns:
         BrakeProof; what is not proved is in its `undecided`, no exception. Where theta1 is 0 or 180
-        degrees the neighbourhoods of the equilibria stay undecided.
+        degrees the neighbourhoods of the equilibria stay undecided, and the orbits' mirror images.
     Raises:
         ValueError: not exactly one of theta1 and theta1_deg; otherwise as `find_brake_orbits`.
         RuntimeError: python-flint is missing; float64 is switched off in JAX.
