@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 # Places that stay open march again in narrow boxes if they are no wider in all [rad].
 WIDEST_AGAIN = 0.02
+# Keys of the pendulum's numbers in the record.
+PENDULUM = ("l1_m", "l2_m", "m1_kg", "m2_kg", "g_m_s2")
 # More undecided places are not listed one by one in words.
 MOST_IN_WORDS = 10
 
@@ -128,6 +130,7 @@ class BrakeProof:
     def record(self) -> dict[str, Any]:
         """One JSON object, degrees and seconds."""
         return {
+            "pendulum": dict(zip(PENDULUM, self.pendulum, strict=True)),
             "theta1": self.release._asdict(),
             "max_period_s": self.max_period,
             "complete": self.complete,

@@ -4,6 +4,7 @@ That a list is complete is trusted because rests are never excluded where there 
 orbit, hidden from the proof, stays open.
 """
 
+import json
 import math
 from fractions import Fraction
 
@@ -16,6 +17,7 @@ flint = pytest.importorskip("flint")
 from flint import acb, arb, arb_series  # noqa: E402
 
 import dpend  # noqa: E402
+from dpend import cli  # noqa: E402
 from dpend.proofs import chebyshev, march  # noqa: E402
 from dpend.proofs.balls import UNIT, Parameters, field, precision, upper  # noqa: E402
 from dpend.proofs.certificate import Question, Release  # noqa: E402
@@ -323,3 +325,17 @@ def test_all_orbits_at_forty_degrees_with_a_short_period():
     table = proof.to_dataframe()
     assert table["theta2_deg"].to_numpy() == pytest.approx([-51.139513966, -157.229758666])
     assert proof.record()["complete"] is True
+
+
+def test_the_command_says_how_many(capsys, monkeypatch):
+    monkeypatch.setattr(cli, "_keep_compiled_code", lambda: None)
+    # No orbit is so short; the paper's shortest at 40 degrees takes 0.75 s.
+    assert cli._run(["certify", "--theta1", "40", "--max-period", "0.2", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["complete"] is True
+    assert record["pendulum"]["l1_m"] == "0.2"
+    assert (record["certificates"], record["undecided"]) == ([], [])
+    assert cli._run(["certify", "--theta1", "40", "--max-period", "1", "--digits", "9"]) == 2
+    assert capsys.readouterr().err == (
+        "dpend: digits does not go with max_period, got 9: leave it out\n"
+    )
