@@ -77,6 +77,8 @@ from dpend.orbits.stability import multipliers as multipliers
 from dpend.orbits.stability import stability_class as stability_class
 from dpend.proofs.certificate import Certificate as Certificate
 from dpend.proofs.certify import certify as certify
+from dpend.proofs.complete import BrakeProof as BrakeProof
+from dpend.proofs.complete import prove_brake_orbits as prove_brake_orbits
 from dpend.proofs.ledger import certify_atlas as certify_atlas
 from dpend.status import Status as Status
 from dpend.status import message as message

@@ -52,6 +52,13 @@ def certify(
         float | None, numeric(help="Guess of the lower rod's release angle [deg].")
     ] = None,
     period: Annotated[float | None, numeric(help="Guess of the period [s].")] = None,
+    max_period: Annotated[
+        float | None,
+        numeric(
+            help="Of THETA1: prove all orbits with a period of at most so many seconds, and that "
+            "they are all."
+        ),
+    ] = None,
     digits: Annotated[
         int | None, counted("Prove as many decimals of theta2 and the period; some 14 without it.")
     ] = None,
@@ -80,16 +87,20 @@ def certify(
             "one, like --theta1 40"
         )
     if atlas is not None:
-        _refuse("an atlas", branch=branch, theta2=theta2, period=period)
+        _refuse("an atlas", branch=branch, theta2=theta2, period=period, max_period=max_period)
         return _certify_rows(pendulum, atlas, digits, store, out, processes)
     _refuse("theta1", store=store, out=out, processes=processes)
+    angle = theta1 or 0.0
+    if max_period is not None:
+        _refuse("max_period", branch=branch, theta2=theta2, period=period, digits=digits)
+        return _certify_all(pendulum, shortest(float(angle)), max_period)
     guess = guess_in(theta2, period)
     both = branch is None and guess is None
-    find = partial(dpend.find_orbit, pendulum, radians("theta1", theta1 or 0.0), guess=guess)
+    find = partial(dpend.find_orbit, pendulum, radians("theta1", angle), guess=guess)
     wanted = None if digits is None else integer("digits", digits, least=1)
     with clock("solving and proving"):
         orbits = [find(branch=name) for name in (BRANCHES if both else (branch,))]
-        text = shortest(float(theta1 or 0.0))
+        text = shortest(float(angle))
         found = [dpend.certify(one, theta1_deg=text, digits=wanted) for one in orbits]
     words = "\n\n".join(textwrap.fill(one.statement(), _WIDTH) for one in found)
     return _record(found), partial(print_text, words), _proved(found)
@@ -140,6 +151,17 @@ def _certify_rows(
     if out is not None:
         rows.save(out)
     return _record(found), partial(print_text, summary(found)), _proved(found)
+
+
+def _certify_all(pendulum: Pendulum, theta1: str, max_period: float) -> Report:
+    """All orbits of one release angle, and that they are all."""
+    with work("rad of theta2 times time") as show:
+        proof = dpend.prove_brake_orbits(
+            pendulum, theta1_deg=theta1, max_period=max_period, progress=show
+        )
+    words = [*(one.statement() for one in proof.certificates), *proof.statement().split("\n")]
+    text = "\n\n".join(textwrap.fill(one, _WIDTH) for one in words)
+    return proof.record(), partial(print_text, text), proof.complete
 
 
 def _record(found: list[Certificate] | tuple[Certificate, ...]) -> dict[str, Any]:

@@ -837,6 +837,18 @@ DOORS = {
         },
         "dpend.proofs.ledger.require_flint",
     ),
+    "prove_brake_orbits": Door(
+        dpend.prove_brake_orbits,
+        {"pendulum": PAPER, "theta1": 1.0, "max_period": 1.0},
+        {
+            "pendulum": kind([*ONE_PENDULUM[0], Pendulum(g=0.0)], [PAPER]),
+            "theta1": NUMBER,
+            "theta1_deg": kind(["", "x", "28.64_7", 0.5, True, 1j, [], {}, object(), HUGE]),
+            "max_period": kind([*POSITIVE[0], 1e3], HALVES),
+            "progress": PROGRESS,
+        },
+        "dpend.proofs.complete.require_flint",
+    ),
     "load_orbits": Door(
         dpend.load_orbits, {}, {"path": kind([*PATH[0], "F.txt", ".", "/no/such/F.json"])}
     ),

@@ -34,7 +34,8 @@ catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files 
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey
 proofs.decimals proofs.balls proofs.taylor proofs.flow proofs.proof proofs.facts proofs.digits
-proofs.certificate proofs.certify proofs.ledger
+proofs.certificate proofs.certify proofs.ledger proofs.lanes proofs.chebyshev proofs.sheet
+proofs.rests proofs.march proofs.squares proofs.complete
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend
