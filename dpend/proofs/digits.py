@@ -17,11 +17,10 @@ import numpy as np
 from flint import arb, arb_poly, arb_series
 
 from dpend.proofs.balls import TINY, field, precision, upper
+from dpend.proofs.chain import ORDER, TERMS
 from dpend.proofs.flow import COVER, Discs, cauchy_bounds, enclose, polynomial_defects
 from dpend.proofs.proof import (
     BITS,
-    ORDER,
-    TERMS,
     NoProof,
     Proof,
     contraction_box,
@@ -41,9 +40,9 @@ LEAST_GAIN = 0.1
 
 
 class Digits(NamedTuple):
-    """theta2 [rad] and the duration of the arc [natural] as balls of `bits` bits."""
+    """The state at the start and the duration of the arc [natural] as balls of `bits` bits."""
 
-    theta2: Any
+    start: list[Any]
     duration: Any
     bits: int
 
@@ -63,19 +62,27 @@ class _Fine:
         self.half = [arb(float(w)) for w in discs.half]
         columns = np.moveaxis(self.series, 0, -1)
         self.rows = [[[arb(float(x)) for x in row] for row in disc] for disc in columns]
-        if problem.ratio is None:
-            self.rows[0][0][0] = problem.theta1().mid()
-        for k in (2, 3):
-            self.rows[0][k][0] = arb(0)
-        for k in (0, 1):
-            if problem.turns is None:
-                self.rows[-1][2 + k][0] = arb(0)
-            else:
-                self.rows[-1][k][0] = (arb.pi() * problem.turns[k]).mid()
+        for i, known in ((0, problem.start), (-1, problem.end)):
+            for k, ball in known.items():
+                self.rows[i][k][0] = ball().mid()
+        self._tie()
         start = Discs(self.series, self.tangents, discs.half, discs.duration)
         self.inverse = np.linalg.inv(self.chain.newton_matrix(start))
         self.signs = start.signs()[:, None, None]
         self.rates = self.series * np.arange(order + 1)[:, None, None] / discs.duration
+
+    def _tie(self) -> None:
+        """Sets the starts that follow from others, up to rounding."""
+        problem = self.chain.problem
+        if problem.ratio is not None:
+            self.rows[0][0][0] = self.rows[0][1][0] * problem.ratio
+        if problem.tie:
+            for row, x in zip(self.rows[-1], self.chain.tied_end(self.start()), strict=True):
+                row[0] = x.mid()
+
+    def start(self) -> list[Any]:
+        """The state at the first centre, its given parts exactly."""
+        return self.chain.exact_start([row[0] for row in self.rows[0]])
 
     def residuals(self) -> Any:
         """Term by term d f(P) - P', in float64."""
@@ -111,14 +118,11 @@ class _Fine:
             ]
         )
         gap += local.sum(0)[:-1] - (local * self.signs).sum(0)[1:]
-        change = -self.inverse @ gap.ravel()
-        states = np.zeros(chain.index.shape)
-        free = chain.index >= 0
-        states[free] = change[chain.index[free]]
-        if chain.problem.ratio is not None:
-            states[0, 0] = chain.problem.ratio * states[0, 1]
-        moved = local + np.einsum("jsab,sb->jsa", self.tangents, states) + self.rates * change[1]
-        self.add(moved, float(change[1]))
+        off = np.array(float(chain.energy_gap(self.start()).mid()))
+        change = -self.inverse @ chain.rows(gap.ravel(), off)
+        states = chain.by_unknown(change)
+        moved = local + np.einsum("jsab,sb->jsa", self.tangents, states) + self.rates * change[0]
+        self.add(moved, float(change[0]))
         return float(max(np.abs(change).max(), np.abs(local).max()))
 
     def add(self, change: Any, duration: float) -> None:
@@ -126,8 +130,7 @@ class _Fine:
             for k, row in enumerate(rows):
                 for n in range(self.order + 1):
                     row[n] = (row[n] + arb(float(change[n, i, k]))).mid()
-        if self.chain.problem.ratio is not None:
-            self.rows[0][0][0] = self.rows[0][1][0] * self.chain.problem.ratio
+        self._tie()
         self.duration = (self.duration + arb(duration)).mid()
 
     def defects(self, terms: int) -> Any:
@@ -142,11 +145,12 @@ class _Fine:
             slopes = field(self.pendulum, [arb_series(row) for row in rows])
             step = self.duration * self.half[i]
             out[i] = polynomial_defects(slopes, rows, step, tails, terms)
-        if problem.ratio is None:
-            out[0, 0] += upper(problem.theta1() - self.rows[0][0][0])
-        if problem.turns is not None:
-            for k, turns in enumerate(problem.turns):
-                out[-1, k] += upper(arb.pi() * turns - self.rows[-1][k][0])
+        for i, known in ((0, problem.start), (-1, problem.end)):
+            for k, ball in known.items():
+                out[i, k] += upper(ball() - self.rows[i][k][0])
+        if problem.tie:
+            for k, x in enumerate(self.chain.tied_end(self.start())):
+                out[-1, k] += upper(x - self.rows[-1][k][0])
         return out * COVER
 
     def rounded(self) -> tuple[Discs, Any]:
@@ -165,7 +169,7 @@ class _Fine:
 
 
 def refine(proof: Proof, digits: int) -> Digits:
-    """theta2 and the duration with errors below 10^-digits, proved anew.
+    """The start and the duration with errors below 10^-digits, proved anew.
 
     Raises:
         NoProof: with the reason.
@@ -202,20 +206,27 @@ def _prove_fine(fine: _Fine, terms: int, bits: int, digits: int) -> Digits:
     with precision(BITS, TERMS):
         pendulum = chain.problem.pendulum.balls()
         tubes = enclose(pendulum, discs, tube, TUBE, np.zeros_like(defects), TERMS)
-        middle, errors = chain.derivative(tubes)
+        middle, errors = chain.derivative(discs, tubes, TUBE)
+        closes = chain.closes(discs, TUBE)
         inverse = np.linalg.inv(middle)
     exact = tubes._replace(defect=defects)
-    radii = contraction_box(operator_of(inverse, gap_of(ends, exact), middle, errors))
+    radii = contraction_box(
+        operator_of(
+            inverse, gap_of(chain, ends, exact, chain.energy_gap(fine.start())), middle, errors
+        )
+    )
     if radii is None:
         raise NoProof("the operator does not map any box at high precision into itself")
-    late = upper(fine.duration - arb(discs.duration)) + float(radii[1])
+    late = upper(fine.duration - arb(discs.duration)) + float(radii[0])
     # Once for the rounding itself, twice for the excursion, which was bounded without it.
     share = 2 * tubes.growth * (late / discs.duration) * COVER
     space = tube - distance * (1 + share) * COVER
-    if not exact.holds(chain.by_unknown(radii), late, discs.duration, space) or late >= TUBE:
+    if not exact.holds(chain.offsets(radii), late, discs.duration, space) or late >= TUBE:
         raise NoProof("the solutions from the box leave the tubes")
-    theta2 = fine.rows[0][1][0] + arb(0, float(radii[0]))
-    duration = fine.duration + arb(0, float(radii[1]))
-    if not max(radii[:2]) < 10.0**-digits:
-        raise NoProof(f"the error is {max(radii[:2]):.1e}, not below 1e-{digits}")
-    return Digits(theta2, duration, bits)
+    if not closes:
+        raise NoProof("where the motion closes, the energy does not tell the last component")
+    off = chain.offsets(radii)[0]
+    start = [x + arb(0, float(r)) for x, r in zip(fine.start(), off, strict=True)]
+    if not (largest := max(radii[: chain.starts.stop])) < 10.0**-digits:
+        raise NoProof(f"the error is {largest:.1e}, not below 1e-{digits}")
+    return Digits(start, fine.duration + arb(0, float(radii[0])), bits)

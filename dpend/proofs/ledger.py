@@ -127,7 +127,7 @@ def summary(certificates: tuple[Certificate, ...]) -> str:
         "nearby"
     ]
     for one in certificates:
-        place = f"theta1 = {one.release.text} {one.release.unit}"
+        place = one.place()
         if one.status != Status.PROVED:
             lines.append(f"{place}, {one.status.name.lower()}: {one.status.sentence} {one.reason}")
         elif one.stability == "not decided":

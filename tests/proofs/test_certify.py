@@ -17,9 +17,16 @@ import proofs  # noqa: E402
 import dpend  # noqa: E402
 import dpend.proofs.flow as flow  # noqa: E402
 from dpend.proofs.balls import precision  # noqa: E402
-from dpend.proofs.certificate import Question, Release, identifier_of  # noqa: E402
+from dpend.proofs.certificate import (  # noqa: E402
+    Passage,
+    Question,
+    Release,
+    identifier_of,
+    read_certificate,
+)
 from dpend.proofs.certify import answer, certify, problem_of  # noqa: E402
-from dpend.proofs.proof import BITS, TERMS, Chain, NoProof, prove, prove_discs  # noqa: E402
+from dpend.proofs.chain import TERMS, Chain  # noqa: E402
+from dpend.proofs.proof import BITS, NoProof, prove, prove_discs  # noqa: E402
 from dpend.status import Status  # noqa: E402
 
 PAPER = dpend.Pendulum()
@@ -36,6 +43,12 @@ REFERENCE = {
 }
 
 
+def start_of(question):
+    """The start of a release in degrees, natural units."""
+    theta1 = math.radians(float(question.release.text))
+    return np.array([theta1, question.theta2, 0.0, 0.0])
+
+
 @pytest.fixture(scope="module")
 def six():
     return dict(zip(proofs.SIX, (answer(question) for question in proofs.six()), strict=True))
@@ -50,7 +63,7 @@ def test_six_motions_of_the_paper_are_proved(six):
     for name, certificate in six.items():
         assert float(certificate.kappa) == pytest.approx(KAPPAS[name], abs=6e-3)
         assert float(certificate.theta2_deg.radius) < 2e-12
-        assert float(certificate.unique_theta2_deg) > 1e-3
+        assert float(certificate.unique_angle_deg) > 1e-3
 
 
 def test_held_digits_lie_in_the_intervals(six):
@@ -74,9 +87,8 @@ def test_fifty_digits_are_the_same_from_two_precisions():
 @pytest.mark.parametrize("theta1", REFERENCE)
 def test_reference_values_at_unit_parameters(theta1):
     theta2, period, kappa = REFERENCE[theta1]
-    proof = prove(
-        problem_of(Question(UNIT, Release(theta1, "rad"), 0, 0, (0, 0))), theta2, period / 4
-    )
+    problem = problem_of(Question(UNIT, Release(theta1, "rad"), 0, 0, (0, 0)))
+    proof = prove(problem, [float(theta1), theta2, 0.0, 0.0], period / 4)
     exact = Question(UNIT, Release(theta1, "rad"), float(proof.discs.series[0, 0, 1]),
                      4 * proof.discs.duration, (0, 0))  # fmt: skip
     certificate = answer(exact)
@@ -139,7 +151,7 @@ def test_non_orbit_near_an_orbit_is_refused(off):
     question = proofs.six()[1]
     problem = problem_of(question)
     with precision(BITS, TERMS):
-        chain = Chain(problem, question.theta2, question.period / 4 / math.sqrt(0.2 / 9.8))
+        chain = Chain(problem, start_of(question), question.period / 4 / math.sqrt(0.2 / 9.8))
         chain.newton()
         chain.states[0, 1] += off
         with pytest.raises(NoProof):
@@ -159,11 +171,71 @@ def test_what_is_not_covered_is_a_status():
     upwards = question._replace(pendulum=("0.2", "0.2", "0.1", "0.1", "-9.8"))
     assert answer(upwards).status == Status.NOT_COVERED
     orbit = dpend.find_orbit(PAPER, math.radians(40), branch="in-phase")
-    assert certify(replace(orbit, symmetry="odd")).status == Status.NOT_COVERED
+    assert not certify(replace(orbit, symmetry="odd")).exists
     for key, value in (("theta2", math.nan), ("period", math.nan), ("period", 0.0)):
         assert answer(question._replace(**{key: value})).status == Status.NOT_PROVED
     assert answer(question._replace(period=1e6)).status == Status.NOT_PROVED
     assert answer(question, 10_000).status == Status.DIGITS_NOT_PROVED
+
+
+# State, period, turns, energy and kappa of a passing, an odd and an asymmetric orbit, m = l = g = 1,
+# as `find_orbits` and `find_orbit` solve them; in the first a rod turns over.
+MOVING = {
+    "passing": ((0.0, math.pi, 0.02685251818266686, 0.9864836046298022), 2.953489010394937,
+                (0, 1), "0", -1.904328184206),
+    "odd": ((1.5502560054844974, -0.35074247538486014, -0.4539732766385053, 1.4001397178570352),
+            5.854632672821845, (0, 0), "0", 1.556712396625),
+    "none": ((0.5320590079412049, 1.2054121937279694, -1.891711193942938, 0.5007097555400518),
+             5.900046149852152, (0, 0), "-0.07891219248209452", 0.793738471866),
+}  # fmt: skip
+
+
+def moving(symmetry):
+    state, period, turns, energy, _ = MOVING[symmetry]
+    angles = ("0", "180") if symmetry == "passing" else ("", repr(math.degrees(state[1])))
+    return Question(UNIT, Passage(symmetry, energy, *angles), state[1], period, turns, state)
+
+
+@pytest.mark.parametrize("symmetry", MOVING)
+def test_orbits_that_never_rest_are_proved(symmetry):
+    certificate = answer(moving(symmetry))
+    assert (certificate.status, certificate.minimal) == (Status.PROVED, True)
+    state, period, _, _, kappa = MOVING[symmetry]
+    for name, value in (("p1", state[2]), ("p2", state[3]), ("period", period)):
+        found = getattr(certificate, name)
+        assert float(found) == pytest.approx(value, abs=2e-12)
+        assert float(found.radius) < 1e-12
+    assert abs(float(certificate.kappa) - kappa) <= float(certificate.kappa.radius) + 1e-9
+    assert float(certificate.unique_momentum) > 0
+    assert "never rests" in certificate.statement()
+    record = json.loads(json.dumps(certificate.record()))
+    assert read_certificate(record).identifier == certificate.identifier
+
+
+@pytest.mark.parametrize("symmetry", MOVING)
+def test_fifty_digits_of_an_orbit_that_never_rests(symmetry):
+    coarse, fine = answer(moving(symmetry)), answer(moving(symmetry), 50)
+    for name in ("p1", "p2", "period"):
+        assert getattr(coarse, name).contains(Fraction(getattr(fine, name).midpoint))
+        assert Fraction(getattr(fine, name).radius) < Fraction(1, 10**50)
+
+
+def test_three_periods_are_not_proved_minimal():
+    """An odd orbit gone round three times is odd again."""
+    odd = answer(moving("odd")._replace(period=3 * MOVING["odd"][1]))
+    assert (odd.status, odd.minimal) == (Status.PROVED, False)
+
+
+def test_solved_passing_orbit_is_certified(unit):
+    start = dpend.State(*MOVING["passing"][0])
+    orbit = dpend.find_orbit(unit, state=start, period=MOVING["passing"][1], symmetry="passing")
+    certificate = certify(orbit, energy="0")
+    assert (certificate.status, certificate.turns) == (Status.PROVED, (0, 1))
+    assert certificate.release == Passage("passing", "0", "0", "180")
+    with pytest.raises(ValueError, match="energy must be the orbit's"):
+        certify(orbit, energy=0.1)
+    with pytest.raises(ValueError, match="theta1_deg does not go with passing orbits"):
+        certify(orbit, theta1_deg="0")
 
 
 def test_bad_input_is_refused_at_the_door():
@@ -244,7 +316,7 @@ def test_checker_catches_a_defect_that_was_left_out(monkeypatch):
     question = proofs.six()[5]
     problem = problem_of(question)
     with precision(BITS, TERMS):
-        chain = Chain(problem, question.theta2, question.period / 4 / math.sqrt(0.2 / 9.8))
+        chain = Chain(problem, start_of(question), question.period / 4 / math.sqrt(0.2 / 9.8))
         chain.newton()
         series = Chain.discs
 
