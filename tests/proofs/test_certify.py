@@ -178,7 +178,7 @@ def test_what_is_not_covered_is_a_status():
     assert answer(question, 10_000).status == Status.DIGITS_NOT_PROVED
 
 
-# State, period, turns, energy and kappa of a passing, an odd and an asymmetric orbit, m = l = g = 1,
+# State, period, turns, energy and kappa of three orbits at m = l = g = 1
 # as `find_orbits` and `find_orbit` solve them; in the first a rod turns over.
 MOVING = {
     "passing": ((0.0, math.pi, 0.02685251818266686, 0.9864836046298022), 2.953489010394937,
@@ -269,6 +269,26 @@ def test_checker_proves_certificates_again(six, name):
     record = json.loads(json.dumps(six[name].record()))
     assert check_certificates.check(record) == ""
     assert len(json.dumps(record)) < 1200
+
+
+@pytest.mark.parametrize(
+    "symmetry",
+    ["passing", *(pytest.param(name, marks=pytest.mark.slow) for name in ("odd", "none"))],
+)
+def test_checker_proves_orbits_that_never_rest(symmetry):
+    record = json.loads(json.dumps(answer(moving(symmetry)).record()))
+    assert check_certificates.check(record) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change", [{"turns": [0, 2]}, {"start": {"energy": "1e-10"}}, {"start": {"theta1": "180"}}]
+)
+def test_checker_catches_a_false_word_about_a_start(change):
+    record = json.loads(json.dumps(answer(moving("passing")).record()))
+    for key, value in change.items():
+        record[key] = record[key] | value if isinstance(value, dict) else value
+    assert check_certificates.check(with_identifier(record)) != ""
 
 
 def test_checker_catches_a_shifted_interval_and_a_radius_cut_in_half(six):
