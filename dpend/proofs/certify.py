@@ -32,6 +32,8 @@ SAME_ANGLE = 1e-12
 SAME_ENERGY = 1e-11
 # Digits that are proved without `digits`, and more than are printed of energies and kappa.
 USUAL_DIGITS, KAPPA_DIGITS = 16, 30
+# Digits with which kappa is enclosed again where float64 does not tell it from 1 or -1.
+DECIDING_DIGITS = 40
 
 
 def certify(
@@ -278,7 +280,7 @@ def _conclude(
     from dpend.proofs.facts import moves, stability_of
 
     best, status, reason = _digits(proof, digits)
-    stability = stability_of(proof)
+    stability = best.stability or _decide(proof, stability_of(proof))
     with precision(best.bits):
         period = best.duration * problem.pendulum.second() * problem.parts
         printed = (digits or USUAL_DIGITS) + 5
@@ -286,13 +288,26 @@ def _conclude(
             _empty(question, status, reason),
             **_start_intervals(question, problem, best.start, printed),
             period=enclosure_of(period, printed),
-            kappa=enclosure_of(stability.kappa, KAPPA_DIGITS),
+            kappa=enclosure_of(stability.kappa, max(KAPPA_DIGITS, printed)),
             stability=stability.name,
             minimal=moves(proof),
             digits=0 if digits is None or reason else digits,
             discs=len(proof.discs.half),
         )
     return replace(found, **_unique_radii(question, problem, proof))
+
+
+def _decide(proof: "Proof", found: Any) -> Any:
+    """Where kappa is not told from 1 or -1, many digits are asked."""
+    from dpend.proofs.digits import refine
+    from dpend.proofs.proof import NoProof
+
+    if found.name != "not decided":
+        return found
+    try:
+        return refine(proof, DECIDING_DIGITS).stability
+    except NoProof:
+        return found
 
 
 def _start_intervals(

@@ -8,16 +8,28 @@ of this needs to be right.
 The proof is that of `proof`, with the defects bounded at high precision and the derivatives on
 narrow tubes about the polynomials rounded to float64: Y is then as small as the defects, and Z is
 what it was.
+
+kappa gets as many digits by the derivative of the flow along the same polynomials, step 4 of `flow`
+with coefficients of many bits.
 """
 
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from flint import arb, arb_poly, arb_series
+from flint import arb, arb_mat, arb_poly, arb_series
 
-from dpend.proofs.balls import TINY, field, precision, upper
+from dpend.proofs.balls import (
+    ENTRIES,
+    SIGNS,
+    TINY,
+    field,
+    field_and_jacobian,
+    precision,
+    upper,
+)
 from dpend.proofs.chain import ORDER, TERMS
+from dpend.proofs.facts import Stability, stability_along
 from dpend.proofs.flow import COVER, Discs, cauchy_bounds, enclose, polynomial_defects
 from dpend.proofs.proof import (
     BITS,
@@ -40,11 +52,15 @@ LEAST_GAIN = 0.1
 
 
 class Digits(NamedTuple):
-    """The state at the start and the duration of the arc [natural] as balls of `bits` bits."""
+    """The state at the start and the duration of the arc [natural] as balls of `bits` bits.
+
+    `stability` is what many bits tell of it, `None` without them.
+    """
 
     start: list[Any]
     duration: Any
     bits: int
+    stability: Stability | None = None
 
 
 class _Fine:
@@ -133,15 +149,20 @@ class _Fine:
         self._tie()
         self.duration = (self.duration + arb(duration)).mid()
 
+    def sizes(self, i: int) -> Any:
+        """The sizes of a disc's coefficients in float64, shape (N + 1, 4), enlarged by more than
+        their rounding and what is lost below the least normal number; the rounding of P(0) is
+        inside the tube.
+        """
+        floats = np.array([[float(x) for x in row] for row in self.rows[i]]).T
+        floats[1:] = np.abs(floats[1:]) * (1 + 1e-15) + TINY
+        return floats
+
     def defects(self, terms: int) -> Any:
         """eta of every disc, the errors of the fixed parts of the states included."""
         problem, out = self.chain.problem, np.zeros(self.chain.index.shape)
         for i, rows in enumerate(self.rows):
-            # Sizes of the coefficients, enlarged by more than their rounding and what is lost below
-            # the least normal number; the rounding of P(0) is inside the tube.
-            floats = np.array([[float(x) for x in row] for row in rows]).T
-            floats[1:] = np.abs(floats[1:]) * (1 + 1e-15) + TINY
-            tails, _ = cauchy_bounds(self.pendulum, floats, TUBE, terms)
+            tails, _ = cauchy_bounds(self.pendulum, self.sizes(i), TUBE, terms)
             slopes = field(self.pendulum, [arb_series(row) for row in rows])
             step = self.duration * self.half[i]
             out[i] = polynomial_defects(slopes, rows, step, tails, terms)
@@ -229,4 +250,69 @@ def _prove_fine(fine: _Fine, terms: int, bits: int, digits: int) -> Digits:
     start = [x + arb(0, float(r)) for x, r in zip(fine.start(), off, strict=True)]
     if not (largest := max(radii[: chain.starts.stop])) < 10.0**-digits:
         raise NoProof(f"the error is {largest:.1e}, not below 1e-{digits}")
-    return Digits(start, fine.duration + arb(0, float(radii[0])), bits)
+    duration = fine.duration + arb(0, float(radii[0]))
+    far = chain.offsets(radii).max(-1) + defects.max(-1)
+    far = far + 2 * tubes.excursion * (float(radii[0]) / discs.duration)
+    ends = _fine_tangents(fine, duration, float((far * tubes.growth).max() * COVER), tubes.growth)
+    return Digits(start, duration, bits, stability_along(ends, chain.problem.symmetry))
+
+
+def _fine_tangents(fine: _Fine, duration: Any, tube: float, growth: Any) -> list[tuple[Any, Any]]:
+    """The derivative of the flow from each centre to s = 1 and to s = -1."""
+    out = []
+    for i in range(len(fine.rows)):
+        blocks, tail = _jacobian_blocks(fine, i, tube)
+        step, terms = duration * fine.half[i], len(blocks)
+        middles = [_middle(block) for block in blocks]
+        tangents = [arb_mat([[int(a == b) for b in range(4)] for a in range(4)])]
+        error = np.zeros((4, 4))
+        for n in range(fine.order):
+            total = arb_mat(4, 4)
+            for j in range(min(n + 1, terms)):
+                total += middles[j] * tangents[n - j]
+            slope = total * (step / (n + 1))
+            tangents.append(_middle(slope))
+            error += _sizes(slope - tangents[-1])
+        sizes = np.array([_sizes(w) for w in tangents])
+        largest = np.array([_sizes(block) for block in blocks])
+        spread = sum(_sizes(x - y) for x, y in zip(blocks, middles, strict=True)) + tail
+        # What products of terms beyond the order of W bring, their divisors left out.
+        beyond = np.cumsum(largest[::-1], 0)[::-1]
+        for k, size in enumerate(sizes):
+            if (first := max(fine.order - k, 0)) < terms:
+                error += upper(step) * (beyond[first] @ size)
+        error += upper(step) * (spread @ sizes.sum(0))
+        off = (error.max(0) * growth[i] * COVER**2 + TINY).tolist()
+        around = arb_mat([[arb(0, off[b]) for b in range(4)] for _ in range(4)])
+        plus, minus = arb_mat(4, 4), arb_mat(4, 4)
+        for n, w in enumerate(tangents):
+            plus += w
+            minus += w if n % 2 == 0 else -w
+        out.append((plus + around, minus + around))
+    return out
+
+
+def _jacobian_blocks(fine: _Fine, i: int, tube: float) -> tuple[list[Any], Any]:
+    """Coefficients of the field's Jacobian within the tube of a disc, 4 x 4 balls, and the tail."""
+    rows, around = fine.rows[i], arb(0, tube)
+    state = [arb_series([row[0] + around, *row[1:]]) for row in rows]
+    _, entries = field_and_jacobian(fine.pendulum, state)
+    terms = fine.order + 2
+    if any(entry.prec < terms for entry in entries):
+        raise ArithmeticError("a power series lost terms")
+    known = [[*entry.coeffs(), *[arb(0)] * terms][:terms] for entry in entries]
+    signs = SIGNS.astype(int).tolist()
+    blocks = [
+        arb_mat([[known[ENTRIES[a, b]][n] * signs[a][b] for b in range(4)] for a in range(4)])
+        for n in range(terms)
+    ]
+    _, tails = cauchy_bounds(fine.pendulum, fine.sizes(i), TUBE, terms)
+    return blocks, np.array(tails)[ENTRIES]
+
+
+def _middle(m: Any) -> Any:
+    return arb_mat(4, 4, [x.mid() for x in m.entries()])
+
+
+def _sizes(m: Any) -> Any:
+    return np.array([upper(x) for x in m.entries()]).reshape(4, 4)

@@ -88,15 +88,23 @@ def narrow(proof: Proof) -> Proof:
 
 
 def _stability(proof: Proof) -> Stability:
+    tubes, symmetry = proof.tubes, proof.chain.problem.symmetry
     with precision(BITS_OF_PRODUCTS):
-        kappa, c = _half_traces(_transition(proof), proof.chain.problem.symmetry)
-        decisive = kappa if c is None else c
-        names = (
-            (bool(abs(decisive) < 1), "elliptic"),
-            (bool(kappa > 1), "hyperbolic"),
-            (bool(kappa < -1), "inverse hyperbolic"),
-        )
-        return Stability(kappa, c, next((name for holds, name in names if holds), "not decided"))
+        pairs = zip(tubes.plus, tubes.minus, tubes.spread, strict=True)
+        ends = [(_matrix(plus, spread), _matrix(minus, spread)) for plus, minus, spread in pairs]
+        return stability_along(ends, symmetry)
+
+
+def stability_along(ends: list[tuple[Any, Any]], symmetry: str) -> Stability:
+    """Encloses kappa from the derivatives of the flow over the discs' halves, forth and back."""
+    kappa, c = _half_traces(_transition(ends), symmetry)
+    decisive = kappa if c is None else c
+    names = (
+        (bool(abs(decisive) < 1), "elliptic"),
+        (bool(kappa > 1), "hyperbolic"),
+        (bool(kappa < -1), "inverse hyperbolic"),
+    )
+    return Stability(kappa, c, next((name for holds, name in names if holds), "not decided"))
 
 
 def _half_traces(q: Any, symmetry: str) -> tuple[Any, Any]:
@@ -127,14 +135,13 @@ def _inverse(m: Any) -> Any:
     return out
 
 
-def _transition(proof: Proof) -> Any:
+def _transition(ends: list[tuple[Any, Any]]) -> Any:
     """The derivative of the flow along the arc."""
-    tubes, last = proof.tubes, len(proof.discs.half) - 1
-    out = _matrix(tubes.plus[0], tubes.spread[0])
-    for i in range(1, last + 1):
-        out = _inverse(_matrix(tubes.minus[i], tubes.spread[i])) * out
+    out, last = ends[0][0], len(ends) - 1
+    for i, (plus, minus) in enumerate(ends[1:], 1):
+        out = _inverse(minus) * out
         if i < last:
-            out = _matrix(tubes.plus[i], tubes.spread[i]) * out
+            out = plus * out
     return out
 
 

@@ -82,6 +82,10 @@ def test_fifty_digits_are_the_same_from_two_precisions():
         assert coarse.contains(Fraction(fine.midpoint))
         assert Fraction(coarse.radius) < Fraction(1, 10**50)
         assert Fraction(fine.radius) < Fraction(1, 10**80)
+    rough = answer(question).kappa
+    assert rough.contains(Fraction(fifty.kappa.midpoint))
+    assert fifty.kappa.contains(Fraction(eighty.kappa.midpoint))
+    assert Fraction(fifty.kappa.radius) < Fraction(1, 10**50)
 
 
 @pytest.mark.parametrize("theta1", REFERENCE)
@@ -218,6 +222,8 @@ def test_fifty_digits_of_an_orbit_that_never_rests(symmetry):
     for name in ("p1", "p2", "period"):
         assert getattr(coarse, name).contains(Fraction(getattr(fine, name).midpoint))
         assert Fraction(getattr(fine, name).radius) < Fraction(1, 10**50)
+    assert coarse.kappa.contains(Fraction(fine.kappa.midpoint))
+    assert Fraction(fine.kappa.radius) < Fraction(1, 10**50)
 
 
 def test_three_periods_are_not_proved_minimal():
