@@ -33,7 +33,7 @@ catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files 
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey
 proofs.decimals proofs.balls proofs.taylor proofs.flow proofs.chain proofs.proof proofs.facts
-proofs.digits proofs.certificate proofs.certify proofs.ledger
+proofs.digits proofs.certificate proofs.question proofs.certify proofs.ledger
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend

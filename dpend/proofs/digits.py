@@ -17,7 +17,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from flint import arb, arb_mat, arb_poly, arb_series
+from flint import arb, arb_mat, arb_poly, arb_series, ctx
 
 from dpend.proofs.balls import (
     ENTRIES,
@@ -204,7 +204,7 @@ def refine(proof: Proof, digits: int) -> Digits:
         with precision(bits, terms):
             fine = _Fine(proof, order)
             _polish(fine, 10.0 ** (2 - goal))
-            return _prove_fine(fine, terms, bits, digits)
+            return _prove_fine(proof, fine, terms, digits)
     except NoProof:
         raise
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
@@ -220,7 +220,7 @@ def _polish(fine: _Fine, enough: float) -> None:
         last = size
 
 
-def _prove_fine(fine: _Fine, terms: int, bits: int, digits: int) -> Digits:
+def _prove_fine(proof: Proof, fine: _Fine, terms: int, digits: int) -> Digits:
     chain, defects, ends = fine.chain, fine.defects(terms), fine.ends()
     discs, distance = fine.rounded()
     tube = np.full(len(discs.half), TUBE)
@@ -244,6 +244,8 @@ def _prove_fine(fine: _Fine, terms: int, bits: int, digits: int) -> Digits:
     space = tube - distance * (1 + share) * COVER
     if not exact.holds(chain.offsets(radii), late, discs.duration, space) or late >= TUBE:
         raise NoProof("the solutions from the box leave the tubes")
+    if not _same_orbit(fine, proof, radii):
+        raise NoProof("it may be another orbit that has these digits")
     if not closes:
         raise NoProof("where the motion closes, the energy does not tell the last component")
     off = chain.offsets(radii)[0]
@@ -254,7 +256,22 @@ def _prove_fine(fine: _Fine, terms: int, bits: int, digits: int) -> Digits:
     far = chain.offsets(radii).max(-1) + defects.max(-1)
     far = far + 2 * tubes.excursion * (float(radii[0]) / discs.duration)
     ends = _fine_tangents(fine, duration, float((far * tubes.growth).max() * COVER), tubes.growth)
-    return Digits(start, duration, bits, stability_along(ends, chain.problem.symmetry))
+    return Digits(start, duration, ctx.prec, stability_along(ends, chain.problem.symmetry))
+
+
+def _same_orbit(fine: _Fine, proof: Proof, radii: Any) -> bool:
+    """Whether the box lies in that of the proof, which holds one orbit only."""
+    chain, centres = proof.chain, proof.discs.series[0]
+    wide, narrow = chain.offsets(proof.radii), chain.offsets(radii)
+    off = np.array(
+        [
+            [upper(row[0] - arb(float(x))) for row, x in zip(rows, states, strict=True)]
+            for rows, states in zip(fine.rows, centres, strict=True)
+        ]
+    )
+    inside = ((off + narrow) * COVER < wide) | (chain.index < 0)
+    late = upper(fine.duration - arb(proof.discs.duration)) + float(radii[0])
+    return bool(inside.all() and late * COVER < proof.radii[0])
 
 
 def _fine_tangents(fine: _Fine, duration: Any, tube: float, growth: Any) -> list[tuple[Any, Any]]:
@@ -264,15 +281,7 @@ def _fine_tangents(fine: _Fine, duration: Any, tube: float, growth: Any) -> list
         blocks, tail = _jacobian_blocks(fine, i, tube)
         step, terms = duration * fine.half[i], len(blocks)
         middles = [_middle(block) for block in blocks]
-        tangents = [arb_mat([[int(a == b) for b in range(4)] for a in range(4)])]
-        error = np.zeros((4, 4))
-        for n in range(fine.order):
-            total = arb_mat(4, 4)
-            for j in range(min(n + 1, terms)):
-                total += middles[j] * tangents[n - j]
-            slope = total * (step / (n + 1))
-            tangents.append(_middle(slope))
-            error += _sizes(slope - tangents[-1])
+        tangents, error = _tangents(middles, step, fine.order)
         sizes = np.array([_sizes(w) for w in tangents])
         largest = np.array([_sizes(block) for block in blocks])
         spread = sum(_sizes(x - y) for x, y in zip(blocks, middles, strict=True)) + tail
@@ -284,12 +293,24 @@ def _fine_tangents(fine: _Fine, duration: Any, tube: float, growth: Any) -> list
         error += upper(step) * (spread @ sizes.sum(0))
         off = (error.max(0) * growth[i] * COVER**2 + TINY).tolist()
         around = arb_mat([[arb(0, off[b]) for b in range(4)] for _ in range(4)])
-        plus, minus = arb_mat(4, 4), arb_mat(4, 4)
-        for n, w in enumerate(tangents):
-            plus += w
-            minus += w if n % 2 == 0 else -w
-        out.append((plus + around, minus + around))
+        even = sum(tangents[2::2], tangents[0])
+        uneven = sum(tangents[3::2], tangents[1])
+        out.append((even + uneven + around, even - uneven + around))
     return out
+
+
+def _tangents(middles: list[Any], step: Any, order: int) -> tuple[list[Any], Any]:
+    """Coefficients of W, exact numbers, and how far they are from those of 1 + d int J W."""
+    tangents = [arb_mat([[int(a == b) for b in range(4)] for a in range(4)])]
+    error = np.zeros((4, 4))
+    for n in range(order):
+        total = arb_mat(4, 4)
+        for j in range(min(n + 1, len(middles))):
+            total += middles[j] * tangents[n - j]
+        slope = total * (step / (n + 1))
+        tangents.append(_middle(slope))
+        error += _sizes(slope - tangents[-1])
+    return tangents, error
 
 
 def _jacobian_blocks(fine: _Fine, i: int, tube: float) -> tuple[list[Any], Any]:

@@ -252,12 +252,16 @@ class Uniqueness(NamedTuple):
     start: float
 
 
-def uniqueness_of(proof: Proof) -> Uniqueness:
-    """The largest box of those tried in which the orbit is the only one; zeros if none is."""
+def uniqueness_of(proof: Proof, own: float) -> Uniqueness:
+    """The largest box of those tried in which the orbit is the only one; zeros if none is.
+
+    Arguments:
+        own: how precisely the start and the duration are known.
+    """
     with precision(BITS, TERMS):
         for width in WIDE_TUBES:
             try:
-                found = _unique_within(proof, width)
+                found = _unique_within(proof, width, own)
             except ArithmeticError:
                 continue
             if found is not None:
@@ -265,7 +269,7 @@ def uniqueness_of(proof: Proof) -> Uniqueness:
     return Uniqueness(0.0, 0.0)
 
 
-def _unique_within(proof: Proof, width: float) -> Uniqueness | None:
+def _unique_within(proof: Proof, width: float, own: float) -> Uniqueness | None:
     chain, discs = proof.chain, proof.discs
     tube = np.full(len(discs.half), width)
     known, pendulum = chain.known_errors(discs), chain.problem.pendulum.balls()
@@ -278,11 +282,11 @@ def _unique_within(proof: Proof, width: float) -> Uniqueness | None:
     box = np.full(chain.size, rho)
     if not operator.maps_inside(box):
         return None
-    return Uniqueness(rho, unique_start(proof, tubes, rho))
+    return Uniqueness(rho, unique_start(proof, tubes, rho, own))
 
 
-def unique_start(proof: Proof, tubes: Tubes, rho: float) -> float:
-    """delta, see the module's page; rounded down, and 0 if it is lost in the box of the proof."""
+def unique_start(proof: Proof, tubes: Tubes, rho: float, own: float) -> float:
+    """delta, see the module's page; rounded down, and 0 if it is lost in the box of the start."""
     chain, half = proof.chain, proof.discs.half
     count = int(chain.starts.stop) - 1
     with precision(BITS_OF_PRODUCTS):
@@ -300,6 +304,5 @@ def unique_start(proof: Proof, tubes: Tubes, rho: float) -> float:
             for k in range(4):
                 row = (abs(column[k, j]) for j in range(count + 1))
                 largest = max(largest, upper(sum(row, arb(0))))
-    own = float(proof.radii[: chain.starts.stop].max())
     delta = (rho - float(proof.radii.max()) - TINY) / largest - 2 * own
     return max(delta / COVER**2, 0.0) if np.isfinite(largest) else 0.0

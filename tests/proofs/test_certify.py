@@ -182,29 +182,16 @@ def test_what_is_not_covered_is_a_status():
     assert answer(question, 10_000).status == Status.DIGITS_NOT_PROVED
 
 
-# State, period, turns, energy and kappa of three orbits at m = l = g = 1
-# as `find_orbits` and `find_orbit` solve them; in the first a rod turns over.
-MOVING = {
-    "passing": ((0.0, math.pi, 0.02685251818266686, 0.9864836046298022), 2.953489010394937,
-                (0, 1), "0", -1.904328184206),
-    "odd": ((1.5502560054844974, -0.35074247538486014, -0.4539732766385053, 1.4001397178570352),
-            5.854632672821845, (0, 0), "0", 1.556712396625),
-    "none": ((0.5320590079412049, 1.2054121937279694, -1.891711193942938, 0.5007097555400518),
-             5.900046149852152, (0, 0), "-0.07891219248209452", 0.793738471866),
-}  # fmt: skip
-
-
-def moving(symmetry):
-    state, period, turns, energy, _ = MOVING[symmetry]
-    angles = ("0", "180") if symmetry == "passing" else ("", repr(math.degrees(state[1])))
-    return Question(UNIT, Passage(symmetry, energy, *angles), state[1], period, turns, state)
+# kappa of the three orbits that never rest, as `find_orbit` has it.
+MOVING = {"passing": -1.904328184206, "odd": 1.556712396625, "none": 0.793738471866}
 
 
 @pytest.mark.parametrize("symmetry", MOVING)
 def test_orbits_that_never_rest_are_proved(symmetry):
-    certificate = answer(moving(symmetry))
+    question, kappa = proofs.moving(symmetry), MOVING[symmetry]
+    certificate = answer(question)
     assert (certificate.status, certificate.minimal) == (Status.PROVED, True)
-    state, period, _, _, kappa = MOVING[symmetry]
+    state, period = question.state, question.period
     for name, value in (("p1", state[2]), ("p2", state[3]), ("period", period)):
         found = getattr(certificate, name)
         assert float(found) == pytest.approx(value, abs=2e-12)
@@ -218,7 +205,7 @@ def test_orbits_that_never_rest_are_proved(symmetry):
 
 @pytest.mark.parametrize("symmetry", MOVING)
 def test_fifty_digits_of_an_orbit_that_never_rests(symmetry):
-    coarse, fine = answer(moving(symmetry)), answer(moving(symmetry), 50)
+    coarse, fine = answer(proofs.moving(symmetry)), answer(proofs.moving(symmetry), 50)
     for name in ("p1", "p2", "period"):
         assert getattr(coarse, name).contains(Fraction(getattr(fine, name).midpoint))
         assert Fraction(getattr(fine, name).radius) < Fraction(1, 10**50)
@@ -226,15 +213,35 @@ def test_fifty_digits_of_an_orbit_that_never_rests(symmetry):
     assert Fraction(fine.kappa.radius) < Fraction(1, 10**50)
 
 
+def test_orbits_between_hyperbolic_and_elliptic_are_decided():
+    """kappa is 1 to 4e-10 here: float64 does not tell, forty digits do."""
+    question = Question(proofs.PAPER, Release("20.306301528593956", "deg"),
+                        math.radians(-27.714549575066354), 1.159874793382541, None)  # fmt: skip
+    certificate = answer(question)
+    assert (certificate.status, certificate.stability) == (Status.PROVED, "hyperbolic")
+    assert float(certificate.kappa) - 1 == pytest.approx(3.894e-10, rel=1e-3)
+
+
+def test_strongly_unstable_orbit_is_the_only_one_nearby():
+    """kappa is 4.9e27: how far, takes more digits of the release than float64 has."""
+    orbit = dpend.find_orbit(PAPER, math.radians(179.9), branch="in-phase")
+    certificate = certify(orbit, theta1_deg="179.9", digits=30)
+    assert (certificate.status, certificate.stability) == (Status.PROVED, "hyperbolic")
+    assert float(certificate.kappa) == pytest.approx(float(orbit.kappa), rel=1e-3)
+    assert 0 < float(certificate.unique_angle_deg) < 1e-12
+
+
 def test_three_periods_are_not_proved_minimal():
     """An odd orbit gone round three times is odd again."""
-    odd = answer(moving("odd")._replace(period=3 * MOVING["odd"][1]))
+    question = proofs.moving("odd")
+    odd = answer(question._replace(period=3 * question.period))
     assert (odd.status, odd.minimal) == (Status.PROVED, False)
 
 
 def test_solved_passing_orbit_is_certified(unit):
-    start = dpend.State(*MOVING["passing"][0])
-    orbit = dpend.find_orbit(unit, state=start, period=MOVING["passing"][1], symmetry="passing")
+    question = proofs.moving("passing")
+    start = dpend.State(*question.state)
+    orbit = dpend.find_orbit(unit, state=start, period=question.period, symmetry="passing")
     certificate = certify(orbit, energy="0")
     assert (certificate.status, certificate.turns) == (Status.PROVED, (0, 1))
     assert certificate.release == Passage("passing", "0", "0", "180")
@@ -282,7 +289,7 @@ def test_checker_proves_certificates_again(six, name):
     ["passing", *(pytest.param(name, marks=pytest.mark.slow) for name in ("odd", "none"))],
 )
 def test_checker_proves_orbits_that_never_rest(symmetry):
-    record = json.loads(json.dumps(answer(moving(symmetry)).record()))
+    record = json.loads(json.dumps(answer(proofs.moving(symmetry)).record()))
     assert check_certificates.check(record) == ""
 
 
@@ -291,7 +298,7 @@ def test_checker_proves_orbits_that_never_rest(symmetry):
     "change", [{"turns": [0, 2]}, {"start": {"energy": "1e-10"}}, {"start": {"theta1": "180"}}]
 )
 def test_checker_catches_a_false_word_about_a_start(change):
-    record = json.loads(json.dumps(answer(moving("passing")).record()))
+    record = json.loads(json.dumps(answer(proofs.moving("passing")).record()))
     for key, value in change.items():
         record[key] = record[key] | value if isinstance(value, dict) else value
     assert check_certificates.check(with_identifier(record)) != ""
