@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 # A proved orbit whose start (natural units) or period (relative) is further than this from the one
 # asked about is another orbit. Solved orbits of the atlas are within 1e-11.
 FAR = 1e-8
-# Digits that are proved without `digits`, and more than are printed of energies and kappa.
-USUAL_DIGITS, KAPPA_DIGITS = 16, 30
+# Digits that are proved without `digits`, and the most that are printed of kappa: as many as
+# check_certificates.py proves again, whose kappa has two fifths of the digits of its box.
+USUAL_DIGITS, KAPPA_DIGITS = 16, 20
 # Digits with which kappa is enclosed again where float64 does not tell it from 1 or -1.
 DECIDING_DIGITS = 40
 
@@ -207,7 +208,7 @@ def _conclude(
             _empty(question, status, reason),
             **_start_intervals(question, problem, best.start, printed),
             period=enclosure_of(period, printed),
-            kappa=enclosure_of(stability.kappa, max(KAPPA_DIGITS, printed)),
+            kappa=enclosure_of(stability.kappa, KAPPA_DIGITS),
             stability=stability.name,
             minimal=moves(proof),
             digits=0 if digits is None or reason else digits,
