@@ -50,6 +50,28 @@ def accelerations(pendulum: Pendulum, x: Any) -> tuple[Any, Any]:
     return first, (pull - c * first) / lam
 
 
+def momenta(pendulum: Pendulum, x: Any) -> tuple[Any, Any]:
+    """The derivatives of the kinetic energy by the angular velocities."""
+    lam, mu = pendulum
+    cross = mu * lam * (x[0] - x[1]).cos()
+    return (1 + mu) * x[2] + cross * x[3], mu * lam * lam * x[3] + cross * x[2]
+
+
+def energy_of(pendulum: Pendulum, x: Any) -> Any:
+    """In units of m1 g l1."""
+    lam, mu = pendulum
+    p1, p2 = momenta(pendulum, x)
+    return (p1 * x[2] + p2 * x[3]) / 2 - (1 + mu) * x[0].cos() - mu * lam * x[1].cos()
+
+
+def energy_slopes(pendulum: Pendulum, x: Any) -> tuple[Any, Any, Any, Any]:
+    """The derivatives of the energy by the state."""
+    lam, mu = pendulum
+    turn = mu * lam * (x[0] - x[1]).sin() * x[2] * x[3]
+    by_angles = (1 + mu) * x[0].sin() - turn, mu * lam * x[1].sin() + turn
+    return *by_angles, *momenta(pendulum, x)
+
+
 def field(pendulum: Pendulum, x: Any) -> list[Any]:
     return [x[2], x[3], *accelerations(pendulum, x)]
 

@@ -1,4 +1,5 @@
-"""The theorem of the paper's six motions and of the eight brake orbits at 40 degrees, in one page.
+"""The theorem of the paper's six motions, of the eight brake orbits at 40 degrees, and of three
+that never rest, in one page.
 
 It proves each to fifty digits (`dpend.certify`), prints what is proved in words and in how long,
 and writes the certificates to certificates.json. `--rows N` proves N rows of the atlas instead,
@@ -18,13 +19,14 @@ from pathlib import Path
 import numpy as np
 
 import dpend
-from dpend.proofs.certificate import Certificate, Question, Release
+from dpend.proofs.certificate import Certificate, Passage, Question, Release
 from dpend.proofs.certify import answer, require_flint
 from dpend.proofs.ledger import questions_of
 
 HERE = Path(__file__).parent
 ATLAS = HERE / "atlas" / "brake_orbits.csv"
 CERTIFICATES = HERE / "certificates.json"
+UNIT = ("1", "1", "1", "1", "1")
 PAPER = ("0.2", "0.2", "0.1", "0.1", "9.8")
 # The digits of the page, and its width.
 DIGITS, WIDTH = 50, 100
@@ -50,6 +52,23 @@ EIGHT = (
     (-151.107616659, 1.923779041, None),
     (-152.332774219, 1.970160641, None),
 )
+# State, period and full turns of three orbits that never rest and their energy, m = l = g = 1: the
+# shortest that passes (0, 180) deg with the energy 0, in which the lower rod turns over; one of the
+# odd branch that leaves the anti-phase family; one without symmetry.
+MOVING = {
+    "passing": (
+        (0.0, math.pi, 0.02685251818266686, 0.9864836046298022),
+        2.953489010394937, (0, 1), "0",
+    ),
+    "odd": (
+        (1.5502560054844974, -0.35074247538486014, -0.4539732766385053, 1.4001397178570352),
+        5.854632672821845, (0, 0), "0",
+    ),
+    "none": (
+        (0.5320590079412049, 1.2054121937279694, -1.891711193942938, 0.5007097555400518),
+        5.900046149852152, (0, 0), "-0.07891219248209452",
+    ),
+}  # fmt: skip
 
 
 def six() -> list[Question]:
@@ -64,6 +83,13 @@ def eight() -> list[Question]:
         Question(PAPER, Release("40", "deg"), math.radians(theta2), period, turns)
         for theta2, period, turns in EIGHT
     ]
+
+
+def moving(symmetry: str) -> Question:
+    """Passing at (0, 180) deg, or with theta2 given exactly."""
+    state, period, turns, energy = MOVING[symmetry]
+    angles = ("0", "180") if symmetry == "passing" else ("", repr(math.degrees(state[1])))
+    return Question(UNIT, Passage(symmetry, energy, *angles), state[1], period, turns, state)
 
 
 def distinct(questions: list[Question]) -> list[Question]:
@@ -109,6 +135,8 @@ def main() -> None:
         print_table([answer(question) for question in sample(options.rows)])
         return
     questions = six()[:2] if options.quick else distinct([*six(), *eight()])
+    if not options.quick:
+        questions += [moving(symmetry) for symmetry in MOVING]
     found = [answer(question, DIGITS) for question in questions]
     for number, certificate in enumerate(found, 1):
         print(f"{number}.", textwrap.fill(certificate.statement(), WIDTH), end="\n\n")

@@ -821,6 +821,7 @@ DOORS = {
                 none=True,
             ),
             "ratio": kind([*NO_INTEGERS, 0, 2, 1], none=True),
+            "energy": kind(["", "x", "0", 0.5, True, math.nan, HUGE, [], object()], none=True),
             "digits": kind(COUNT[0], ONES, none=True),
         },
         "dpend.proofs.certify.require_flint",

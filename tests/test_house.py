@@ -33,9 +33,9 @@ orbits.family_files orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
 catalogue.survey
-proofs.decimals proofs.balls proofs.taylor proofs.flow proofs.proof proofs.facts proofs.digits
-proofs.certificate proofs.certify proofs.ledger proofs.lanes proofs.chebyshev proofs.sheet
-proofs.rests proofs.march proofs.squares proofs.complete
+proofs.decimals proofs.balls proofs.taylor proofs.flow proofs.chain proofs.proof proofs.facts
+proofs.digits proofs.certificate proofs.question proofs.certify proofs.ledger proofs.lanes
+proofs.chebyshev proofs.sheet proofs.rests proofs.march proofs.squares proofs.complete
 inverse.measurements inverse.windows inverse.gauss_newton inverse.search inverse.uncertainty
 inverse.estimates inverse.fit inverse.problem inverse.nearest inverse.design
 dpend

@@ -128,6 +128,11 @@ class Parameters:
         """The natural unit of time sqrt(l1/g) [s]."""
         return fraction_ball(Fraction(self.l1) / Fraction(self.g)).sqrt()
 
+    def momentum(self) -> Any:
+        """The natural unit of momentum m1 l1 sqrt(g l1) [kg m^2/s]."""
+        length, gravity = Fraction(self.l1), Fraction(self.g)
+        return fraction_ball(Fraction(self.m1) * length) * fraction_ball(gravity * length).sqrt()
+
     def joule(self) -> Any:
         """The natural unit of energy m1 g l1 [J]."""
         return fraction_ball(Fraction(self.m1) * Fraction(self.g) * Fraction(self.l1))
@@ -171,9 +176,17 @@ def field_and_jacobian(pendulum: Coefficients, state: Any) -> tuple[Any, Any]:
     return value, (*entries, pull_a - cos1 * weight, -pull_a, pull_a - cos2 * nu)
 
 
-def energy_ball(pendulum: Coefficients, a: Any, b: Any) -> Any:
-    """The energy of a release from rest at these angles [m1 g l1]."""
-    return -(a.cos() * pendulum.weight) - b.cos() * pendulum.nu
+def total_energy(pendulum: Coefficients, state: Any) -> Any:
+    """H of a state [m1 g l1]; the kinetic energy is (a' p + b' q)/2."""
+    a, b, p, q = state
+    u, v, *_ = field(pendulum, state)
+    return (u * p + v * q) / 2 - a.cos() * pendulum.weight - b.cos() * pendulum.nu
+
+
+def energy_gradient(pendulum: Coefficients, state: Any) -> tuple[Any, ...]:
+    """The derivatives of H by a, b, p and q: Hamilton's equations the other way round."""
+    u, v, force1, force2 = field(pendulum, state)
+    return -force1, -force2, u, v
 
 
 def disc(middle: float, radius: float) -> Any:

@@ -8,27 +8,31 @@ import math
 import time
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from dpend.checks import at_most_one, instance, integer, known_number, one_of, single
-from dpend.mechanics.pendulum import Pendulum, known_pendulum
+from dpend.checks import instance, integer, single
+from dpend.mechanics.pendulum import known_pendulum
 from dpend.orbits.arc import RELEASED_SYMMETRIES
 from dpend.orbits.orbit import PeriodicOrbit
-from dpend.proofs.certificate import Certificate, Question, Release
-from dpend.proofs.decimals import below, shortest
-from dpend.records import parse_decimal
+from dpend.proofs.certificate import Certificate, Passage, Question, Release
+from dpend.proofs.decimals import below
+from dpend.proofs.question import passage_question, release_question
 from dpend.status import Status
 
 if TYPE_CHECKING:
-    from dpend.proofs.proof import Problem, Proof
+    from dpend.proofs.chain import Problem
+    from dpend.proofs.digits import Digits
+    from dpend.proofs.proof import Proof
 
-# A proved orbit whose theta2 [rad] or period (relative) is further than this from the one asked
-# about is another orbit. Solved orbits of the atlas are within 1e-11.
+# A proved orbit whose start (natural units) or period (relative) is further than this from the one
+# asked about is another orbit. Solved orbits of the atlas are within 1e-11.
 FAR = 1e-8
-# The release angle in degrees and the orbit's theta1 [rad] may differ by rounding of both.
-SAME_ANGLE = 1e-12
-# Digits that are proved without `digits`, and more than are printed of energies and kappa.
-USUAL_DIGITS, KAPPA_DIGITS = 16, 30
+# Digits that are proved without `digits`, and the most that are printed of kappa: as many as
+# check_certificates.py proves again, whose kappa has two fifths of the digits of its box.
+USUAL_DIGITS, KAPPA_DIGITS = 16, 20
+# Digits with which kappa is enclosed again where float64 does not tell it from 1 or -1.
+DECIDING_DIGITS = 40
 
 
 def certify(
@@ -36,48 +40,49 @@ def certify(
     *,
     theta1_deg: str | float | Any | None = None,
     ratio: int | Any | None = None,
+    energy: str | float | Any | None = None,
     digits: int | Any | None = None,
 ) -> Certificate:
-    """Proves a periodic orbit that is released from rest.
+    """Proves a periodic orbit: released from rest, or never at rest, whatever its symmetry.
 
     The pendulum's parameters count as the shortest decimals that read back as its float64 numbers:
     0.2 is 1/5. A proof that does not succeed is a `status` with its reason, no exception.
 
     Arguments:
-        orbit: a single centred or brake orbit, as `find_orbit` returns it.
+        orbit: a single one, as `find_orbit`, `find_orbits` and families return it.
         theta1_deg: the release angle as the exact decimal of degrees that was meant. By default
             theta1 is exactly the float64 number of radians in `orbit`.
         ratio: 1 or -1, to prove an orbit on the line theta1 = ratio theta2 instead of one at a
             release angle.
-        digits: prove as many decimals of theta2 and the period; 50 take half a second.
+        energy: of an orbit that never rests, the energy as the exact decimal of joules that was
+            meant. By default the shortest decimal that reads back as the orbit's energy.
+        digits: prove as many decimals of the start and the period; 50 take half a second.
     Raises:
-        ValueError: no single orbit; a theta1_deg that is not the orbit's; digits out of range.
+        ValueError: no single orbit; a theta1_deg or energy that is not the orbit's, or does not go
+            with its symmetry; digits out of range.
         RuntimeError: python-flint is missing.
     """
     instance("orbit", orbit, PeriodicOrbit, "dpend.find_orbit(pendulum, theta1, branch=...)")
     for name in ("theta1", "theta2", "period"):
         single(name, getattr(orbit, name))
     wanted = None if digits is None else integer("digits", digits, least=1)
-    pendulum = known_pendulum(orbit.pendulum)
-    decimals = decimals_of(pendulum)
-    centred = orbit.symmetry == "centred"
-    turns = (int(orbit.turns[0]), int(orbit.turns[1])) if centred else None
-    release = _release(float(orbit.theta1), float(orbit.theta2), theta1_deg, ratio)
-    theta2, period = float(orbit.theta2), float(orbit.period)
-    question = Question(decimals, release, theta2, period, turns)
-    if orbit.symmetry not in RELEASED_SYMMETRIES:
-        reason = (
-            f"It is {orbit.symmetry}; only {' and '.join(RELEASED_SYMMETRIES)} orbits are covered."
-        )
-        return replace(_empty(question, Status.NOT_COVERED, reason), symmetry=orbit.symmetry)
+    known_pendulum(orbit.pendulum)
+    if orbit.symmetry in RELEASED_SYMMETRIES:
+        _refuse(orbit, energy=energy)
+        question = release_question(orbit, theta1_deg, ratio)
+    else:
+        _refuse(orbit, theta1_deg=theta1_deg, ratio=ratio)
+        question = passage_question(orbit, energy)
     require_flint()
     return answer(question, wanted)
 
 
-def decimals_of(pendulum: Pendulum) -> tuple[str, str, str, str, str]:
-    """The shortest decimals that read back as the pendulum's numbers."""
-    l1, l2, m1, m2, g = (shortest(float(leaf)) for leaf in vars(pendulum).values())
-    return l1, l2, m1, m2, g
+def _refuse(orbit: PeriodicOrbit, **options: Any) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(
+                f"{name} does not go with {orbit.symmetry} orbits, got {value!r:.60}: leave it out"
+            )
 
 
 def require_flint() -> None:
@@ -94,36 +99,8 @@ def require_flint() -> None:
         ) from None
 
 
-def _release(theta1: float, theta2: float, theta1_deg: Any, ratio: Any) -> Release:
-    at_most_one(theta1_deg=theta1_deg, ratio=ratio)
-    if ratio is not None:
-        sign = one_of("ratio", ratio, (1, -1))
-        if abs(theta1 - sign * theta2) > SAME_ANGLE * max(1, abs(theta1)):
-            raise ValueError(
-                f"ratio must be theta1/theta2 of the orbit, got {sign} for theta1 = {theta1} and "
-                f"theta2 = {theta2} rad: solve for it with dpend.find_orbit(..., ratio={sign})"
-            )
-        return Release(shortest(theta1), "rad", sign)
-    if theta1_deg is None:
-        return Release(shortest(theta1), "rad")
-    text = theta1_deg if isinstance(theta1_deg, str) else ""
-    if not text:
-        text = shortest(known_number("theta1_deg", theta1_deg, unit="deg"))
-    try:
-        off = abs(math.radians(parse_decimal(text)) - theta1)
-    except ValueError:
-        off = math.inf
-    if not off <= SAME_ANGLE * max(1, abs(theta1)):
-        raise ValueError(
-            f"theta1_deg must be the orbit's release angle, {math.degrees(theta1)!r} deg, got "
-            f"{text!r:.60}: give what the orbit was solved for"
-        )
-    return Release(text, "deg")
-
-
 def _empty(question: Question, status: Status, reason: str) -> Certificate:
-    symmetry = "brake" if question.turns is None else "centred"
-    turns = question.turns or (0, 0)
+    symmetry, turns = question.symmetry, question.turns or (0, 0)
     return Certificate(question.pendulum, question.release, symmetry, turns, status, reason)
 
 
@@ -132,16 +109,40 @@ def problem_of(question: Question) -> "Problem":
     from flint import arb
 
     from dpend.proofs.balls import Parameters, fraction_ball
-    from dpend.proofs.proof import Problem
+    from dpend.proofs.chain import Problem, at_turns, release
 
-    text, unit, ratio = question.release
+    pendulum, start = Parameters(*question.pendulum), question.release
 
-    def theta1() -> Any:
-        if unit == "deg":
-            return arb.pi() * fraction_ball(Fraction(text)) / 180
-        return fraction_ball(Fraction(float(text)))
+    def angle(text: str) -> Any:
+        return arb.pi() * fraction_ball(Fraction(text)) / 180
 
-    return Problem(Parameters(*question.pendulum), theta1, question.turns, ratio or None)
+    if isinstance(start, Release):
+        text, unit, ratio = start
+
+        def theta1() -> Any:
+            return angle(text) if unit == "deg" else fraction_ball(Fraction(float(text)))
+
+        return release(pendulum, theta1, question.turns, ratio or None)
+
+    def energy() -> Any:
+        return fraction_ball(Fraction(start.energy)) / pendulum.joule()
+
+    given = {k: partial(angle, text) for k, text in enumerate((start.theta1, start.theta2)) if text}
+    n1, n2 = question.turns or (0, 0)
+    if start.symmetry == "passing":
+        end = int(start.theta1) // 180 + n1, int(start.theta2) // 180 + n2
+        return Problem(pendulum, "passing", given, at_turns(end), energy=energy)
+    return Problem(pendulum, start.symmetry, given, turns=(n1, n2), energy=energy)
+
+
+def start_of(question: Question, problem: "Problem") -> list[float]:
+    """The start in natural units."""
+    if question.state is None:
+        theta1 = problem.ratio * question.theta2 if problem.ratio else problem.start[0]().mid()
+        return [float(theta1), question.theta2, 0.0, 0.0]
+    unit = float(problem.pendulum.momentum().mid())
+    a, b, p, q = question.state
+    return [a, b, p / unit, q / unit]
 
 
 def answer(question: Question, digits: int | None = None) -> Certificate:
@@ -151,13 +152,19 @@ def answer(question: Question, digits: int | None = None) -> Certificate:
     started = time.process_time()
     if not float(question.pendulum[4]) > 0:
         return _empty(question, Status.NOT_COVERED, "Gravity must point downwards.")
-    if not (math.isfinite(question.theta2) and 0 < question.period < math.inf):
+    numbers = (question.theta2, question.period, *(question.state or ()))
+    if not (all(map(math.isfinite, numbers)) and question.period > 0):
         return _empty(question, Status.NOT_PROVED, "There is no orbit to begin with.")
     try:
         problem = problem_of(question)
         second = math.sqrt(float(question.pendulum[0]) / float(question.pendulum[4]))
-        proof = prove(problem, question.theta2, question.period / problem.parts / second)
-        found = _conclude(question, problem, proof, digits)
+        start = start_of(question, problem)
+        duration = question.period / problem.parts / second
+        proof = prove(problem, start, duration)
+        if reason := _another(proof, start, duration):
+            found = _empty(question, Status.ANOTHER_ORBIT, reason)
+        else:
+            found = _conclude(question, problem, proof, digits)
     except NoProof as error:
         found = _empty(question, Status.NOT_PROVED, str(error) + ".")
     return replace(found, seconds=time.process_time() - started)
@@ -178,57 +185,99 @@ def _digits(proof: "Proof", digits: int | None) -> tuple[Any, Status, str]:
             status, reason = Status.DIGITS_NOT_PROVED, f"{error}."
     else:
         status, reason = Status.PROVED, ""
-    theta2 = arb(float(proof.discs.series[0, 0, 1]), float(proof.radii[0]))
-    duration = arb(proof.discs.duration, float(proof.radii[1]))
-    return Digits(theta2, duration, BITS_OF_PRODUCTS), status, reason
+    exact = proof.chain.exact_start([arb(float(x)) for x in proof.discs.series[0, 0]])
+    off = proof.chain.offsets(proof.radii)[0]
+    start = [x + arb(0, float(r)) for x, r in zip(exact, off, strict=True)]
+    duration = arb(proof.discs.duration, float(proof.radii[0]))
+    return Digits(start, duration, BITS_OF_PRODUCTS), status, reason
 
 
 def _conclude(
     question: Question, problem: "Problem", proof: "Proof", digits: int | None
 ) -> Certificate:
     """The facts of a proof, in SI units."""
-    from flint import arb
-
-    from dpend.proofs.balls import enclosure_of, energy_ball, precision
-    from dpend.proofs.facts import moves, stability_of, uniqueness_of
+    from dpend.proofs.balls import enclosure_of, precision
+    from dpend.proofs.facts import moves, stability_of
 
     best, status, reason = _digits(proof, digits)
-    stability, unique = stability_of(proof), uniqueness_of(proof)
+    stability = best.stability or _decide(proof, stability_of(proof))
     with precision(best.bits):
-        theta1 = best.theta2 * problem.ratio if problem.ratio else problem.theta1()
-        energy = energy_ball(problem.pendulum.balls(), theta1, best.theta2)
-        second = problem.pendulum.second() * problem.parts
-        period, printed = best.duration * second, (digits or USUAL_DIGITS) + 5
+        period = best.duration * problem.pendulum.second() * problem.parts
+        printed = (digits or USUAL_DIGITS) + 5
         found = replace(
             _empty(question, status, reason),
-            theta2_deg=enclosure_of(best.theta2 * 180 / arb.pi(), printed),
+            **_start_intervals(question, problem, best.start, printed),
             period=enclosure_of(period, printed),
-            energy=enclosure_of(energy * problem.pendulum.joule(), printed),
             kappa=enclosure_of(stability.kappa, KAPPA_DIGITS),
             stability=stability.name,
             minimal=moves(proof),
             digits=0 if digits is None or reason else digits,
             discs=len(proof.discs.half),
         )
-    if unique.release > 0:
-        scale = float(second) * (1 - 1e-9)
-        degrees = below(math.degrees(unique.release))
-        found = replace(
-            found, unique_theta2_deg=degrees, unique_period=below(unique.release * scale)
-        )
-    return _same_orbit(question, found)
+    return replace(found, **_unique_radii(question, problem, proof, best))
 
 
-def _same_orbit(question: Question, found: Certificate) -> Certificate:
-    """Refuses an orbit that Newton's method went to from another place."""
-    theta2, period = math.radians(float(found.theta2_deg or 0)), float(found.period or 0)
-    if (
-        abs(theta2 - question.theta2) <= FAR
-        and abs(period - question.period) <= FAR * question.period
-    ):
+def _decide(proof: "Proof", found: Any) -> Any:
+    """Where kappa is not told from 1 or -1, many digits are asked."""
+    from dpend.proofs.digits import refine
+    from dpend.proofs.proof import NoProof
+
+    if found.name != "not decided":
         return found
-    reason = (
-        f"The orbit that was proved nearby has theta2 = {found.theta2_deg} deg and the period "
-        f"{found.period} s."
-    )
-    return _empty(question, Status.ANOTHER_ORBIT, reason)
+    try:
+        return refine(proof, DECIDING_DIGITS).stability
+    except NoProof:
+        return found
+
+
+def _start_intervals(
+    question: Question, problem: "Problem", start: Any, printed: int
+) -> dict[str, Any]:
+    """What is not given of the start: of a release theta2 and the energy, else what moves."""
+    from flint import arb
+
+    from dpend.proofs.balls import enclosure_of, total_energy
+
+    degrees = [x * 180 / arb.pi() for x in start[:2]]
+    if isinstance(question.release, Release):
+        energy = total_energy(problem.pendulum.balls(), start) * problem.pendulum.joule()
+        return {
+            "theta2_deg": enclosure_of(degrees[1], printed),
+            "energy": enclosure_of(energy, printed),
+        }
+    unit = problem.pendulum.momentum()
+    angles = {f"theta{k + 1}_deg": degrees[k] for k in (0, 1) if k not in problem.start}
+    balls = angles | {"p1": start[2] * unit, "p2": start[3] * unit}
+    return {name: enclosure_of(ball, printed) for name, ball in balls.items()}
+
+
+def _unique_radii(
+    question: Question, problem: "Problem", proof: "Proof", best: "Digits"
+) -> dict[str, Any]:
+    """How far the orbit is proved to be the only one; rounded down."""
+    from dpend.proofs.balls import upper
+    from dpend.proofs.facts import uniqueness_of
+
+    own = max(upper(x - x.mid()) for x in (*best.start, best.duration))
+    radius = uniqueness_of(proof, own).start
+    if not radius > 0:
+        return {}
+    second = float(problem.pendulum.second().mid()) * problem.parts * (1 - 1e-9)
+    found: dict[str, Any] = {"unique_period": below(radius * second)}
+    if isinstance(question.release, Release) or len(problem.start) < 2:
+        found["unique_angle_deg"] = below(math.degrees(radius))
+    if isinstance(question.release, Passage):
+        unit = float(problem.pendulum.momentum().mid()) * (1 - 1e-9)
+        found["unique_momentum"] = below(radius * unit)
+    return found
+
+
+def _another(proof: "Proof", start: list[float], duration: float) -> str:
+    """Says so if Newton's method went to an orbit in another place; else empty. Natural units."""
+    problem, own = proof.chain.problem, proof.discs.series[0, 0]
+    far = max(abs(float(x) - y) for x, y in zip(own, start, strict=True))
+    if far <= FAR and abs(proof.discs.duration - duration) <= FAR * duration:
+        return ""
+    period = proof.discs.duration * problem.parts * float(problem.pendulum.second().mid())
+    angles = f"theta1 = {math.degrees(own[0]):.15g} deg, theta2 = {math.degrees(own[1]):.15g} deg"
+    return f"The orbit that was proved nearby has {angles} and the period {period:.15g} s."

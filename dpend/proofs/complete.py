@@ -31,8 +31,9 @@ from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.find import swinging_pendulum
 from dpend.orbits.orbit import PeriodicOrbit
 from dpend.proofs.certificate import Certificate, Question, Release
-from dpend.proofs.certify import answer, decimals_of, problem_of, require_flint
+from dpend.proofs.certify import answer, problem_of, require_flint
 from dpend.proofs.decimals import shortest
+from dpend.proofs.question import decimals_of
 from dpend.records import frame, parse_decimal
 
 if TYPE_CHECKING:
@@ -275,7 +276,7 @@ def _survey(
     parameters = problem.pendulum
     with precision(BITS):
         exact, floats = parameters.balls(), parameters.floats()
-        theta1, second = problem.theta1(), parameters.second()
+        theta1, second = problem.start[0](), parameters.second()
         middle = float(theta1.mid())
         off = upper(theta1 - arb(middle))
         end = upper(fraction_ball(Fraction(longest)) / 2 / second)

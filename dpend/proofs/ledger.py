@@ -27,8 +27,9 @@ from dpend.catalogue.table import column_values
 from dpend.checks import function, instance, integer
 from dpend.places import check_place, file_path, read_text
 from dpend.proofs.certificate import Certificate, Question, Release, read_certificate
-from dpend.proofs.certify import answer, decimals_of, require_flint
+from dpend.proofs.certify import answer, require_flint
 from dpend.proofs.decimals import shortest
+from dpend.proofs.question import decimals_of
 from dpend.records import json_text, parse_json
 from dpend.status import Status
 
@@ -127,7 +128,7 @@ def summary(certificates: tuple[Certificate, ...]) -> str:
         "nearby"
     ]
     for one in certificates:
-        place = f"theta1 = {one.release.text} {one.release.unit}"
+        place = one.place()
         if one.status != Status.PROVED:
             lines.append(f"{place}, {one.status.name.lower()}: {one.status.sentence} {one.reason}")
         elif one.stability == "not decided":

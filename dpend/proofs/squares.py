@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dpend.proofs.certificate import Certificate, Question
-from dpend.proofs.certify import problem_of
+from dpend.proofs.certify import problem_of, start_of
 from dpend.proofs.facts import uniqueness_of
 from dpend.proofs.march import distances
 from dpend.proofs.proof import NoProof, prove
@@ -51,10 +51,13 @@ def _square(rest: Rest, second: float) -> tuple[float, float, float] | None:
     question, certificate, passes = rest
     problem = problem_of(question)
     try:
-        proof = prove(problem, question.theta2, question.period / problem.parts / second)
+        start, duration = start_of(question, problem), question.period / problem.parts / second
+        proof = prove(problem, start, duration)
     except NoProof:
         return None
-    radius = (uniqueness_of(proof).release - float(proof.radii[:2].max())) * INWARD
+    # The rest is within this of the square's middle, which the radius takes off.
+    own = max(float(proof.radii[0]), float(proof.chain.offsets(proof.radii)[0].max()))
+    radius = uniqueness_of(proof, own).start * INWARD
     theta2, time = float(proof.discs.series[0, 0, 1]), proof.discs.duration
     angle, period = certificate.theta2_deg, certificate.period
     if angle is None or period is None:

@@ -17,9 +17,16 @@ import proofs  # noqa: E402
 import dpend  # noqa: E402
 import dpend.proofs.flow as flow  # noqa: E402
 from dpend.proofs.balls import precision  # noqa: E402
-from dpend.proofs.certificate import Question, Release, identifier_of  # noqa: E402
+from dpend.proofs.certificate import (  # noqa: E402
+    Passage,
+    Question,
+    Release,
+    identifier_of,
+    read_certificate,
+)
 from dpend.proofs.certify import answer, certify, problem_of  # noqa: E402
-from dpend.proofs.proof import BITS, TERMS, Chain, NoProof, prove, prove_discs  # noqa: E402
+from dpend.proofs.chain import TERMS, Chain  # noqa: E402
+from dpend.proofs.proof import BITS, NoProof, prove, prove_discs  # noqa: E402
 from dpend.status import Status  # noqa: E402
 
 PAPER = dpend.Pendulum()
@@ -36,6 +43,12 @@ REFERENCE = {
 }
 
 
+def start_of(question):
+    """The start of a release in degrees, natural units."""
+    theta1 = math.radians(float(question.release.text))
+    return np.array([theta1, question.theta2, 0.0, 0.0])
+
+
 @pytest.fixture(scope="module")
 def six():
     return dict(zip(proofs.SIX, (answer(question) for question in proofs.six()), strict=True))
@@ -50,7 +63,7 @@ def test_six_motions_of_the_paper_are_proved(six):
     for name, certificate in six.items():
         assert float(certificate.kappa) == pytest.approx(KAPPAS[name], abs=6e-3)
         assert float(certificate.theta2_deg.radius) < 2e-12
-        assert float(certificate.unique_theta2_deg) > 1e-3
+        assert float(certificate.unique_angle_deg) > 1e-3
 
 
 def test_held_digits_lie_in_the_intervals(six):
@@ -69,14 +82,17 @@ def test_fifty_digits_are_the_same_from_two_precisions():
         assert coarse.contains(Fraction(fine.midpoint))
         assert Fraction(coarse.radius) < Fraction(1, 10**50)
         assert Fraction(fine.radius) < Fraction(1, 10**80)
+    rough = answer(question).kappa
+    assert rough.contains(Fraction(fifty.kappa.midpoint))
+    assert abs(Fraction(fifty.kappa.midpoint) - Fraction(eighty.kappa.midpoint)) < 1e-19
+    assert Fraction(fifty.kappa.radius) < Fraction(1, 10**19)
 
 
 @pytest.mark.parametrize("theta1", REFERENCE)
 def test_reference_values_at_unit_parameters(theta1):
     theta2, period, kappa = REFERENCE[theta1]
-    proof = prove(
-        problem_of(Question(UNIT, Release(theta1, "rad"), 0, 0, (0, 0))), theta2, period / 4
-    )
+    problem = problem_of(Question(UNIT, Release(theta1, "rad"), 0, 0, (0, 0)))
+    proof = prove(problem, [float(theta1), theta2, 0.0, 0.0], period / 4)
     exact = Question(UNIT, Release(theta1, "rad"), float(proof.discs.series[0, 0, 1]),
                      4 * proof.discs.duration, (0, 0))  # fmt: skip
     certificate = answer(exact)
@@ -139,7 +155,7 @@ def test_non_orbit_near_an_orbit_is_refused(off):
     question = proofs.six()[1]
     problem = problem_of(question)
     with precision(BITS, TERMS):
-        chain = Chain(problem, question.theta2, question.period / 4 / math.sqrt(0.2 / 9.8))
+        chain = Chain(problem, start_of(question), question.period / 4 / math.sqrt(0.2 / 9.8))
         chain.newton()
         chain.states[0, 1] += off
         with pytest.raises(NoProof):
@@ -159,11 +175,81 @@ def test_what_is_not_covered_is_a_status():
     upwards = question._replace(pendulum=("0.2", "0.2", "0.1", "0.1", "-9.8"))
     assert answer(upwards).status == Status.NOT_COVERED
     orbit = dpend.find_orbit(PAPER, math.radians(40), branch="in-phase")
-    assert certify(replace(orbit, symmetry="odd")).status == Status.NOT_COVERED
+    assert not certify(replace(orbit, symmetry="odd")).exists
     for key, value in (("theta2", math.nan), ("period", math.nan), ("period", 0.0)):
         assert answer(question._replace(**{key: value})).status == Status.NOT_PROVED
     assert answer(question._replace(period=1e6)).status == Status.NOT_PROVED
     assert answer(question, 10_000).status == Status.DIGITS_NOT_PROVED
+
+
+# kappa of the three orbits that never rest, as `find_orbit` has it.
+MOVING = {"passing": -1.904328184206, "odd": 1.556712396625, "none": 0.793738471866}
+
+
+@pytest.mark.parametrize("symmetry", MOVING)
+def test_orbits_that_never_rest_are_proved(symmetry):
+    question, kappa = proofs.moving(symmetry), MOVING[symmetry]
+    certificate = answer(question)
+    assert (certificate.status, certificate.minimal) == (Status.PROVED, True)
+    state, period = question.state, question.period
+    for name, value in (("p1", state[2]), ("p2", state[3]), ("period", period)):
+        found = getattr(certificate, name)
+        assert float(found) == pytest.approx(value, abs=2e-12)
+        assert float(found.radius) < 1e-12
+    assert abs(float(certificate.kappa) - kappa) <= float(certificate.kappa.radius) + 1e-9
+    assert float(certificate.unique_momentum) > 0
+    assert "never rests" in certificate.statement()
+    record = json.loads(json.dumps(certificate.record()))
+    assert read_certificate(record).identifier == certificate.identifier
+
+
+@pytest.mark.parametrize("symmetry", MOVING)
+def test_fifty_digits_of_an_orbit_that_never_rests(symmetry):
+    coarse, fine = answer(proofs.moving(symmetry)), answer(proofs.moving(symmetry), 50)
+    for name in ("p1", "p2", "period"):
+        assert getattr(coarse, name).contains(Fraction(getattr(fine, name).midpoint))
+        assert Fraction(getattr(fine, name).radius) < Fraction(1, 10**50)
+    assert coarse.kappa.contains(Fraction(fine.kappa.midpoint))
+    assert Fraction(fine.kappa.radius) < Fraction(1, 10**18)
+
+
+def test_orbits_between_hyperbolic_and_elliptic_are_decided():
+    """kappa is 1 to 4e-10 here: float64 does not tell, forty digits do."""
+    question = Question(proofs.PAPER, Release("20.306301528593956", "deg"),
+                        math.radians(-27.714549575066354), 1.159874793382541, None)  # fmt: skip
+    certificate = answer(question)
+    assert (certificate.status, certificate.stability) == (Status.PROVED, "hyperbolic")
+    assert check_certificates.check(json.loads(json.dumps(certificate.record()))) == ""
+    assert float(certificate.kappa) - 1 == pytest.approx(3.894e-10, rel=1e-3)
+
+
+def test_strongly_unstable_orbit_is_the_only_one_nearby():
+    """kappa is 4.9e27: how far, takes more digits of the release than float64 has."""
+    orbit = dpend.find_orbit(PAPER, math.radians(179.9), branch="in-phase")
+    certificate = certify(orbit, theta1_deg="179.9", digits=30)
+    assert (certificate.status, certificate.stability) == (Status.PROVED, "hyperbolic")
+    assert float(certificate.kappa) == pytest.approx(float(orbit.kappa), rel=1e-3)
+    assert 0 < float(certificate.unique_angle_deg) < 1e-12
+
+
+def test_three_periods_are_not_proved_minimal():
+    """An odd orbit gone round three times is odd again."""
+    question = proofs.moving("odd")
+    odd = answer(question._replace(period=3 * question.period))
+    assert (odd.status, odd.minimal) == (Status.PROVED, False)
+
+
+def test_solved_passing_orbit_is_certified(unit):
+    question = proofs.moving("passing")
+    start = dpend.State(*question.state)
+    orbit = dpend.find_orbit(unit, state=start, period=question.period, symmetry="passing")
+    certificate = certify(orbit, energy="0")
+    assert (certificate.status, certificate.turns) == (Status.PROVED, (0, 1))
+    assert certificate.release == Passage("passing", "0", "0", "180")
+    with pytest.raises(ValueError, match="energy must be the orbit's"):
+        certify(orbit, energy=0.1)
+    with pytest.raises(ValueError, match="theta1_deg does not go with passing orbits"):
+        certify(orbit, theta1_deg="0")
 
 
 def test_bad_input_is_refused_at_the_door():
@@ -197,6 +283,26 @@ def test_checker_proves_certificates_again(six, name):
     record = json.loads(json.dumps(six[name].record()))
     assert check_certificates.check(record) == ""
     assert len(json.dumps(record)) < 1200
+
+
+@pytest.mark.parametrize(
+    "symmetry",
+    ["passing", *(pytest.param(name, marks=pytest.mark.slow) for name in ("odd", "none"))],
+)
+def test_checker_proves_orbits_that_never_rest(symmetry):
+    record = json.loads(json.dumps(answer(proofs.moving(symmetry)).record()))
+    assert check_certificates.check(record) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change", [{"turns": [0, 2]}, {"start": {"energy": "1e-10"}}, {"start": {"theta1": "180"}}]
+)
+def test_checker_catches_a_false_word_about_a_start(change):
+    record = json.loads(json.dumps(answer(proofs.moving("passing")).record()))
+    for key, value in change.items():
+        record[key] = record[key] | value if isinstance(value, dict) else value
+    assert check_certificates.check(with_identifier(record)) != ""
 
 
 def test_checker_catches_a_shifted_interval_and_a_radius_cut_in_half(six):
@@ -244,7 +350,7 @@ def test_checker_catches_a_defect_that_was_left_out(monkeypatch):
     question = proofs.six()[5]
     problem = problem_of(question)
     with precision(BITS, TERMS):
-        chain = Chain(problem, question.theta2, question.period / 4 / math.sqrt(0.2 / 9.8))
+        chain = Chain(problem, start_of(question), question.period / 4 / math.sqrt(0.2 / 9.8))
         chain.newton()
         series = Chain.discs
 

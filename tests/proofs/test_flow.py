@@ -21,10 +21,11 @@ from dpend.proofs.balls import (  # noqa: E402
     precision,
     upper,
 )
+from dpend.proofs.chain import release  # noqa: E402
 from dpend.proofs.decimals import Enclosure, below  # noqa: E402
 from dpend.proofs.digits import refine  # noqa: E402
 from dpend.proofs.flow import Discs, Tubes, enclose  # noqa: E402
-from dpend.proofs.proof import Problem, prove  # noqa: E402
+from dpend.proofs.proof import prove  # noqa: E402
 from dpend.proofs.taylor import jacobian_series, motion_series, tangent_series  # noqa: E402
 
 PAPER = Parameters("0.2", "0.2", "0.1", "0.1", "9.8")
@@ -131,14 +132,15 @@ def test_simple_pendulum_is_enclosed_to_a_hundred_digits(degrees):
 
     with precision(500):
         quarter = arb.pi() / 2 / (theta1() / 2).cos().agm(arb(1))
-    proof = prove(Problem(SIMPLE, theta1, (0, 0)), 1e-9, float(quarter) * (1 + 1e-9))
-    assert abs(proof.discs.series[0, 0, 1]) <= proof.radii[0]
+    start = [math.radians(float(degrees)), 1e-9, 0.0, 0.0]
+    proof = prove(release(SIMPLE, theta1, (0, 0)), start, float(quarter) * (1 + 1e-9))
+    assert abs(proof.discs.series[0, 0, 1]) <= proof.radii[1]
     with precision(64):
-        assert arb(proof.discs.duration, float(proof.radii[1])).overlaps(quarter)
+        assert arb(proof.discs.duration, float(proof.radii[0])).overlaps(quarter)
     fine = refine(proof, 100)
     with precision(500):
         assert fine.duration.contains(quarter)
-        assert fine.theta2.contains(0)
+        assert fine.start[1].contains(0)
         assert upper(fine.duration - quarter) < 1e-100
 
 
