@@ -90,7 +90,7 @@ _LOOP_IN_ONE_KERNEL = ("xla_cpu_small_while_loop_byte_threshold", "1000000")
 _VECTOR_WIDTH = ("xla_cpu_prefer_vector_width", "512")
 
 
-def _known_to_xla(*names: str) -> bool:
+def known_to_xla(*names: str) -> bool:
     """Whether the installed XLA mentions every one of `names` (a search of its shared library, a
     few milliseconds).
     """
@@ -122,10 +122,10 @@ def _extended_flags(flags: str) -> str:
 
     added = []
     name, width = _VECTOR_WIDTH
-    if not spoken_of(name) and _has_avx512() and _known_to_xla(name):
+    if not spoken_of(name) and _has_avx512() and known_to_xla(name):
         added.append(f"--{name}={width}")
     extra = [option for option in (_SHARE_OUTPUTS, _LOOP_IN_ONE_KERNEL) if not spoken_of(option[0])]
-    if extra and _known_to_xla("xla_backend_extra_options", *(name for name, _ in extra)):
+    if extra and known_to_xla("xla_backend_extra_options", *(name for name, _ in extra)):
         added.append(
             "--xla_backend_extra_options=" + ",".join(f"{name}={value}" for name, value in extra)
         )

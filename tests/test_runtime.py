@@ -110,8 +110,8 @@ def test_options_are_added_only_where_the_user_is_silent():
 
 
 def test_unknown_options_are_found_out():
-    assert _runtime._known_to_xla("xla_backend_extra_options")
-    assert not _runtime._known_to_xla("xla_cpu_no_such_option_as_this")
+    assert _runtime.known_to_xla("xla_backend_extra_options")
+    assert not _runtime.known_to_xla("xla_cpu_no_such_option_as_this")
 
 
 @pytest.mark.slow

@@ -72,6 +72,7 @@ def sincos(x: ArrayLike) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]
 
 
 @jax.custom_jvp
+@jax.jit
 def _sincos(x: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     turns = lax.round(x * _TWO_OVER_PI, lax.RoundingMethod.TO_NEAREST_EVEN)
     high, middle, low = (turns * piece for piece in _PI_2)  # exact products

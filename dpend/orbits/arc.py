@@ -15,7 +15,8 @@ Everything here is in natural units, l1 = m1 = g = 1: a pendulum is then (l2/l1,
 scaling laws hold to the last digit.
 """
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from dpend.checks import Scalar
+from dpend.checks import Scalar, is_traced
 from dpend.mechanics.linear import fast_frequency, fastest
 from dpend.mechanics.pendulum import Pendulum, State, vector_field
 from dpend.methods.scheme import Scheme
@@ -36,7 +37,6 @@ SEGMENTS = 16
 UNKNOWNS = 4 * SEGMENTS + 2
 # The conditions at the ends of the arc, by symmetry; the index is what compiled code is told.
 SYMMETRIES = ("centred", "brake", "odd", "passing", "none")
-PASSING, NONE = SYMMETRIES.index("passing"), SYMMETRIES.index("none")
 RELEASED_SYMMETRIES = ("centred", "brake")
 # What part of the period the arc is.
 PARTS = {"centred": 4, "brake": 2, "odd": 2, "passing": 2, "none": 1}
@@ -119,6 +119,15 @@ class Equations(NamedTuple):
     segments: _Segments
 
 
+def no_equations() -> Equations:
+    """Zeros in the shapes of `shooting_equations`, for a loop to begin with: tracing the equations
+    for their shapes alone takes as long as tracing them.
+    """
+    rows, matrix, share = (SEGMENTS, 4), (SEGMENTS, 4, 4), (SEGMENTS,)
+    segments = _Segments(*map(jnp.zeros, (rows, matrix, rows, share, rows, share)))
+    return Equations(jnp.zeros(UNKNOWNS - 1), jnp.zeros((UNKNOWNS - 1, UNKNOWNS)), segments)
+
+
 def shooting_equations(pendulum: Pendulum, point: Array, steps: Scalar, arc: Arc) -> Equations:
     """4 S + 1 equations: each segment ends where the next begins, and five conditions on the first
     node and the end.
@@ -160,34 +169,56 @@ def end_conditions(
       is at an extreme, theta' . grad V = 0: every periodic orbit has such a place.
     """
     full_turns = jnp.append(2 * jnp.pi * arc.turns, jnp.zeros(2))
+    at_centre = end[:2] - jnp.pi * arc.turns
 
-    def gradient_and_power(start: Array) -> Array:
-        slope = _field(pendulum, State(*start))
-        pull = _field(pendulum, State(*start[:2], *jnp.zeros(2)))[2:]  # -grad V
-        return jnp.concatenate([-slope[2:], slope[:2], -(slope[:2] @ pull)[None]])
+    def linear(name: str, *conditions: Array) -> tuple[Array, Array]:
+        return jnp.concatenate([*conditions, unfolding[None]]), jnp.asarray(_LINEAR[name])
 
-    gradient, power = jnp.split(gradient_and_power(start), [4])
-    curvature, change = jnp.split(jax.jacfwd(gradient_and_power)(start), [4])
-    by_end = unfolding * curvature, jnp.eye(4), gradient
+    @cache  # once for the two of them
+    def gradients() -> tuple[Array, Array]:
+        around = partial(_gradients, pendulum)
+        return around(start), jax.jacfwd(around)(start)
 
-    def unfolded(sign: float, phase: Array) -> Array:
-        """The derivative of end + sign start + unfolding gradient, and of the phase."""
-        rows = jnp.column_stack([sign * jnp.eye(4) + by_end[0], *by_end[1:]])
-        return jnp.concatenate([rows, jnp.append(phase, jnp.zeros(5))[None]])
+    def unfolded(sign: float, difference: Array, phase: int) -> tuple[Array, Array]:
+        """end + sign start + unfolding grad H, and a phase condition: one of `_gradients`."""
+        values, changes = gradients()
+        gradient, curvature = values[:4], changes[:4]
+        rows = jnp.column_stack([
+            sign * jnp.eye(4) + unfolding * curvature, jnp.eye(4), gradient
+        ])  # fmt: skip
+        last = jnp.append(changes[phase], jnp.zeros(5))[None]
+        closing = difference - full_turns + unfolding * gradient
+        return jnp.append(closing, values[phase]), jnp.concatenate([rows, last])
 
-    value = jnp.stack([
-        jnp.concatenate([start[2:], end[:2] - jnp.pi * arc.turns, unfolding[None]]),
-        jnp.concatenate([start[2:], end[2:], unfolding[None]]),
-        jnp.append(end + start - full_turns + unfolding * gradient, gradient[2]),
-        jnp.concatenate([_from_centre(start), end[:2] - jnp.pi * arc.turns, unfolding[None]]),
-        jnp.append(end - start - full_turns + unfolding * gradient, power),
-    ])  # fmt: skip
-    derivative = {
-        **{name: jnp.asarray(rows) for name, rows in _LINEAR.items()},
-        "odd": unfolded(1.0, curvature[2]),
-        "none": unfolded(-1.0, change[0]),
-    }
-    return value[arc.symmetry], jnp.stack([derivative[name] for name in SYMMETRIES])[arc.symmetry]
+    return by_symmetry(
+        arc,
+        centred=lambda: linear("centred", start[2:], at_centre),
+        brake=lambda: linear("brake", start[2:], end[2:]),
+        odd=lambda: unfolded(1.0, end + start, _SWING),
+        passing=lambda: linear("passing", _from_centre(start), at_centre),
+        none=lambda: unfolded(-1.0, end - start, _POWER),
+    )
+
+
+def by_symmetry(arc: Arc, **cases: Callable[[], Any]) -> Any:
+    """What belongs to an arc's symmetry: of `cases`, one for each, only that one is computed where
+    the symmetry is known before tracing; elsewhere all of them are, and one is chosen.
+    """
+    if not is_traced(arc.symmetry):
+        return cases[SYMMETRIES[int(arc.symmetry)]]()
+    values = [cases[name]() for name in SYMMETRIES]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[arc.symmetry], *values)
+
+
+# Where the phase conditions are among `_gradients`: theta1', and theta' . grad V.
+_SWING, _POWER = 2, 4
+
+
+def _gradients(pendulum: Pendulum, state: Array) -> Array:
+    """grad H, which is (-p', theta'), and the power -theta' . grad V."""
+    slope = _field(pendulum, State(*state))
+    pull = _field(pendulum, State(*state[:2], *jnp.zeros(2)))[2:]  # -grad V
+    return jnp.concatenate([-slope[2:], slope[:2], -(slope[:2] @ pull)[None]])
 
 
 def _from_centre(start: Array) -> Array:

@@ -19,14 +19,14 @@ from dpend.mechanics.pendulum import Pendulum, State, hamiltonian, vector_field
 from dpend.orbits.arc import (
     LOG_DELTA,
     MOST_SEGMENT_STEPS,
-    NONE,
-    PASSING,
     SEGMENTS,
     TURN,
     UNKNOWNS,
     Arc,
     Equations,
     Factors,
+    by_symmetry,
+    no_equations,
     shooting_equations,
     solve,
     solve_transposed,
@@ -132,6 +132,14 @@ _SIZES = [math.prod(_SHAPES.get(name, ())) for name in Solved._fields]
 ROW = sum(_SIZES)
 
 
+def no_point() -> Solved:
+    """A `Solved` of NaN and zeros, of a point that was not sought yet."""
+    kinds = {"steps": 0, "iterations": 0, "converged": False}
+    return Solved(*(
+        jnp.full(_SHAPES.get(name, ()), kinds.get(name, jnp.nan)) for name in Solved._fields
+    ))  # fmt: skip
+
+
 def unpack_table(table: np.ndarray) -> Solved:
     """The rows of a table as one `Solved` with a leading axis."""
     columns = np.split(table, np.cumsum(_SIZES)[:-1], axis=1)
@@ -162,7 +170,14 @@ def _rounding(pendulum: Pendulum, point: Array, arc: Arc) -> Array:
     sizes = jnp.max(jnp.abs(point[:LOG_DELTA].reshape(SEGMENTS, 4)), axis=0)
     none = jnp.zeros(2)
     angles, rest = jnp.append(none, sizes[:2]), jnp.append(none, sizes[2:])
-    ends = jnp.stack([angles, rest, sizes, angles, sizes])[arc.symmetry]
+    ends = by_symmetry(
+        arc,
+        centred=lambda: angles,
+        brake=lambda: rest,
+        odd=lambda: sizes,
+        passing=lambda: angles,
+        none=lambda: sizes,
+    )
     unit = _ROUNDINGS * jnp.maximum(1.0, pendulum.m2 / pendulum.m1) ** 0.25
     return unit * jnp.concatenate([jnp.tile(sizes, SEGMENTS - 1), ends, none])
 
@@ -177,15 +192,26 @@ def _errors(
     carry to what is asked. Where `fixed` is off, the curve's slope tells what the others are off
     by; at a fold, where that is infinite, its curvature does.
     """
-    energy, direction = _of_moving(pendulum, n.point)
-    passing = arc.symmetry == PASSING
-    fixed = jnp.where(passing | (arc.symmetry == NONE), energy, jnp.asarray(aim.fixed))
-    asked = jnp.where(passing, direction, jnp.asarray(aim.asked))
-    wanted = jnp.stack([fixed, asked, time])
+
+    def at_aim() -> Array:
+        return jnp.stack([jnp.asarray(aim.fixed), jnp.asarray(aim.asked)])
+
+    def moving() -> Array:
+        return _of_moving(pendulum, n.point)
+
+    pair = by_symmetry(
+        arc,
+        centred=at_aim,
+        brake=at_aim,
+        odd=at_aim,
+        passing=moving,
+        none=lambda: at_aim().at[0].set(moving()[0]),
+    )
+    wanted = jnp.concatenate([pair, time[None]])
     pulled = solve_transposed(n.factors, wanted.T).T * _rounding(pendulum, n.point, arc)
-    off, moving = jnp.sqrt(jnp.sum(pulled[0] ** 2)), wanted[0] @ tangent
-    slope = jnp.maximum(jnp.maximum(jnp.abs(moving), jnp.sqrt(off)), jnp.finfo(float).tiny)
-    along = (wanted[1:] @ tangent / slope * jnp.where(moving < 0, -1.0, 1.0))[:, None]
+    off, pace = jnp.sqrt(jnp.sum(pulled[0] ** 2)), wanted[0] @ tangent
+    slope = jnp.maximum(jnp.maximum(jnp.abs(pace), jnp.sqrt(off)), jnp.finfo(float).tiny)
+    along = (wanted[1:] @ tangent / slope * jnp.where(pace < 0, -1.0, 1.0))[:, None]
     change = wanted[1:] @ n.update - along[:, 0] * (wanted[0] @ n.update)
     return jnp.abs(change) + jnp.sqrt(jnp.sum((pulled[1:] - along * pulled[:1]) ** 2, axis=1))
 
@@ -256,7 +282,6 @@ def correct(pendulum: Pendulum, aim: Aim, arc: Arc) -> Solved:
     error estimate.
     """
     zero = jnp.zeros(())
-    equations = jax.eval_shape(shooting_equations, pendulum, aim.predicted, aim.steps, arc)
     start = _Newton(
         point=aim.predicted,
         iterations=jnp.asarray(0),
@@ -267,7 +292,7 @@ def correct(pendulum: Pendulum, aim: Aim, arc: Arc) -> Solved:
         update=aim.predicted,
         null=aim.row,
         side=zero,
-        equations=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), equations),
+        equations=no_equations(),
         factors=(jnp.eye(UNKNOWNS), jnp.zeros(UNKNOWNS, jnp.int32)),
     )
 
@@ -295,7 +320,14 @@ def _describe_root(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved
 
     level, slope = jax.jvp(energy, (n.point[:4],), (tangent[:4],))
     wanted = jnp.ceil(jnp.nan_to_num(jnp.max(s.turn) / TURN, nan=1.0))
-    rates = n.update[2:4] / _inertia(pendulum)
+
+    def angles() -> Array:
+        return n.update[:2]
+
+    def rates() -> Array:
+        return n.update[2:4] / _inertia(pendulum)
+
+    change = by_symmetry(arc, centred=angles, brake=angles, odd=angles, passing=rates, none=angles)
     return Solved(
         point=n.point,
         tangent=tangent,
@@ -304,7 +336,7 @@ def _describe_root(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved
         contraction=n.contraction,
         steps=jnp.clip(wanted, 1, MOST_SEGMENT_STEPS).astype(int),
         converged=n.done == 2,
-        release_change=jnp.max(jnp.abs(jnp.where(arc.symmetry == PASSING, rates, n.update[:2]))),
+        release_change=jnp.max(jnp.abs(change)),
         angle_error=angle_error,
         time_error=time_error,
         iterations=n.iterations,

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from dpend.checks import Scalar
 from dpend.mechanics.pendulum import Pendulum
-from dpend.orbits.arc import MOST_SEGMENT_STEPS, TURN, UNKNOWNS, Arc, arc_of
-from dpend.orbits.newton import METRIC, THETA1, THETA2, TOLERANCE, Aim, Solved, correct
+from dpend.orbits.arc import MOST_SEGMENT_STEPS, TURN, UNKNOWNS, arc_of
+from dpend.orbits.newton import METRIC, THETA1, THETA2, TOLERANCE, Aim, Solved, no_point
 from dpend.orbits.walk import LONGEST_STEP, STRAYED, Walk, hermite, start_at_mode, take_step
 from dpend.status import Status
 
@@ -109,23 +109,19 @@ def search(pendulum: Pendulum, slow: Scalar, wish: Wish, last: Aim) -> Search:
         )
         return jax.tree.map(partial(jnp.where, final), solved, _bound(walked))
 
-    start = _start(pendulum, slow, wish, last, arc)
+    start = _start(pendulum, slow, wish, last)
     return lax.while_loop(lambda s: s.status < 0, attempt, start)
 
 
-def _start(pendulum: Pendulum, slow: Scalar, wish: Wish, last: Aim, arc: Arc) -> Search:
+def _start(pendulum: Pendulum, slow: Scalar, wish: Wish, last: Aim) -> Search:
     begin, zero = start_at_mode(pendulum, slow), jnp.asarray(0)
     finite = jnp.isfinite(wish.target + jnp.sum(begin.point) + jnp.sum(begin.tangent))
     aim = jax.tree.map(
         jnp.asarray, last._replace(predicted=begin.point, row=jnp.zeros(UNKNOWNS), steps=zero)
     )
-    shapes = jax.eval_shape(partial(correct, arc=arc), pendulum, aim)
-    root = jax.tree.map(
-        lambda leaf: jnp.full(leaf.shape, jnp.nan if leaf.dtype == float else 0, leaf.dtype), shapes
-    )
     return Search(
         walk=begin,
-        root=root._replace(point=begin.point),
+        root=no_point()._replace(point=begin.point),
         aim=aim,
         best=begin.point,
         found=jnp.asarray(False),
