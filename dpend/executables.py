@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
 
 from dpend._runtime import known_to_xla
 from dpend.checks import is_traced
@@ -78,14 +79,22 @@ def _compile(function: Any, arguments: tuple, static: tuple) -> Callable[..., An
     parts are then not found when it is loaded.
     """
     kept = jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
-    jax.config.update("jax_enable_compilation_cache", False)
+    _use_cache(False)
     try:
         lowered = function.lower(*arguments, *static)
         options = _QUICKLY if known_to_xla(*_QUICKLY) else None
         compiled: Callable[..., Any] = lowered.compile(compiler_options=options)
     finally:
-        jax.config.update("jax_enable_compilation_cache", kept)
+        _use_cache(kept)
     return compiled
+
+
+def _use_cache(wanted: bool) -> None:
+    """Switches JAX's compilation cache, about which JAX asks once in a process unless it is
+    reset.
+    """
+    jax.config.update("jax_enable_compilation_cache", wanted)
+    compilation_cache.reset_cache()
 
 
 def _key(name: str, arguments: tuple, static: tuple) -> str:

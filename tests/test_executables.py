@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from dpend import executables
 from dpend.executables import keep_executables, run_kept
@@ -46,6 +47,24 @@ def test_a_loaded_program_gives_the_bits_of_the_traced_one(folder, monkeypatch):
     assert (folder.stat().st_mode & 0o777, path.stat().st_mode & 0o777) == (0o700, 0o600)
     monkeypatch.setattr(executables, "_compile", lambda *_: pytest.fail("it was traced"))
     assert answer() == traced == [np.asarray(part).tobytes() for part in solve(*GIVEN)]
+
+
+def test_programs_are_kept_beside_a_compilation_cache_that_knows_them(folder, tmp_path):
+    """A program that XLA took from JAX's cache cannot be written: JAX has to be kept from it."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "cache"))
+    try:
+        compilation_cache.reset_cache()
+        traced = answer()
+        for path in folder.iterdir():
+            path.unlink()
+        assert answer() == traced
+        (path,) = folder.iterdir()
+        assert executables._read(path, path.stem) is not None
+        assert executables._runs(executables._read(path, path.stem), GIVEN)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+        compilation_cache.reset_cache()
 
 
 def test_what_is_not_as_it_was_written_is_ignored_and_written_anew(folder):
