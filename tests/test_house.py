@@ -27,7 +27,8 @@ maps.lanes maps.grid maps.cost maps.tiles maps.disk maps.store maps.layout maps.
 maps.section maps.returns maps.periodic maps.rotation
 orbits.stability orbits.arc orbits.newton orbits.single orbits.rest orbits.implicit orbits.walk
 orbits.search orbits.curve orbits.follow orbits.path orbits.orbit orbits.derivatives orbits.samples
-orbits.zones orbits.special orbits.passages orbits.files orbits.through orbits.find orbits.family
+orbits.zones orbits.extrema orbits.special orbits.passages orbits.files orbits.through
+orbits.request orbits.guess orbits.find orbits.family
 orbits.branching orbits.continuation
 catalogue.bicubic catalogue.rows catalogue.scan catalogue.table catalogue.files catalogue.atlas
 catalogue.release catalogue.energy catalogue.track catalogue.progress catalogue.entries
