@@ -670,7 +670,7 @@ DOORS = {
             "symmetry": kind([*NO_CHOICES, "odd"], ["brake", "centred"], none=True),
             "ratio": kind([0, 2, 1.5, True, "1"], [-1]),
         },
-        "dpend.orbits.find._near_guess",
+        "dpend.orbits.guess._near_guess",
     ),
     "find_orbit, from a state": Door(
         dpend.find_orbit,
@@ -1023,6 +1023,7 @@ DOORS = {
         dpend.sweep,
         {"quantity": reach, "pendulum": PAPER, "axes": {"theta1": [0.1, 0.2]}},
         {
+            "client": AXES,
             "quantity": kind([None, *NO_FUNCTIONS], [reach]),
             "pendulum": ONE_PENDULUM,
             "axes": kind(

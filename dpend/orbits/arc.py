@@ -200,13 +200,15 @@ def end_conditions(
     )
 
 
-def by_symmetry(arc: Arc, **cases: Callable[[], Any]) -> Any:
-    """What belongs to an arc's symmetry: of `cases`, one for each, only that one is computed where
-    the symmetry is known before tracing; elsewhere all of them are, and one is chosen.
+def by_symmetry(
+    arc: Arc, otherwise: Callable[[], Any] | None = None, **cases: Callable[[], Any]
+) -> Any:
+    """What belongs to an arc's symmetry: that case alone where the symmetry is known before
+    tracing; elsewhere all of them are computed, and one is chosen.
     """
     if not is_traced(arc.symmetry):
-        return cases[SYMMETRIES[int(arc.symmetry)]]()
-    values = [cases[name]() for name in SYMMETRIES]
+        return cases.get(SYMMETRIES[int(arc.symmetry)], otherwise)()  # type: ignore[misc]
+    values = [cases.get(name, otherwise)() for name in SYMMETRIES]  # type: ignore[misc]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[arc.symmetry], *values)
 
 

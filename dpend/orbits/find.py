@@ -14,29 +14,21 @@ less, theta2 and the period, and its motion is all that is known: it is solved i
 come from the implicit function theorem at the root (`implicit`), never from Newton's iterations.
 """
 
-import math
-import sys
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
 
 from dpend._runtime import require_float64
 from dpend.checks import (
     Scalar,
-    at_most_one,
     flag,
     integer,
     is_traced,
     known_value,
     number,
-    one_of,
-    several,
-    shown,
     single,
 )
 from dpend.executables import run_kept
@@ -44,53 +36,30 @@ from dpend.mechanics.pendulum import (
     Pendulum,
     State,
     check_pendulum,
-    hamiltonian,
     known_pendulum,
-    released,
 )
 from dpend.mechanics.units import natural
-from dpend.orbits.arc import PARTS, RELEASED_SYMMETRIES
+from dpend.orbits.guess import find_near_guess
 from dpend.orbits.implicit import (
     ArcGiven,
     Known,
-    PieceGiven,
     arc_equations,
     implicit,
     know_solved,
     parameters_of,
-    piece_equations,
 )
 from dpend.orbits.orbit import (
-    BRANCHES,
-    Outcome,
     PeriodicOrbit,
     mirrored,
     orbit_in_units,
     outcome_of,
 )
-from dpend.orbits.rest import reduce_to_minimal
+from dpend.orbits.request import check_request, guess_of, leave_out
 from dpend.orbits.search import Wish, last_aim, search
 from dpend.orbits.single import (
     FINE,
-    MOST_STEPS_IN_ONE_PIECE,
-    Line,
-    LineNewton,
-    Settings,
-    clock,
-    newton_on_line,
-    rate_along,
-    residual_of,
-    solve_twice,
-    steps_for,
 )
-from dpend.orbits.stability import stability_of
 from dpend.orbits.through import orbit_through, request_of
-from dpend.status import Status
-
-# How near to an equilibrium a search may end, in units of the swing.
-_AT_EQUILIBRIUM = 1e-6
-# Two solves of one orbit: angles [rad] and periods, relative.
-_SAME_ORBIT = 1e-8
 
 
 @partial(jax.jit, static_argnames="error")
@@ -117,78 +86,6 @@ def _on_branch(
     _, known = implicit(equations, values, parameters_of(pendulum, target), given)
     orbit = orbit_in_units(pendulum, Known(*known), jnp.zeros(2), "centred", outcome)
     return mirrored(orbit, side)
-
-
-@partial(jax.jit, static_argnames=("symmetry", "error"))
-def _near_guess(
-    pendulum: Pendulum,
-    theta1: Scalar,
-    directions: tuple[Array, Array],
-    start: tuple[Scalar, Scalar],
-    symmetry: str,
-    settings: tuple,
-    error: bool,
-) -> PeriodicOrbit:
-    """The orbit to which Newton's method leads from `start` = (x, period), with its minimal period,
-    among the releases at theta1 * origin + x * direction.
-    """
-    origin, direction = directions
-    turn, tolerance, max_iterations = settings
-    scaled = natural(lax.stop_gradient(pendulum))
-    line = Line(lax.stop_gradient(theta1) * origin, direction)
-    second = jnp.sqrt(pendulum.l1 / pendulum.g)
-    x, period = start
-    log_time = lax.stop_gradient(jnp.log(period / (PARTS[symmetry] * second)))
-    x = lax.stop_gradient(x)
-    rate = clock(scaled)
-    for _ in range(2):  # the rate decides the steps, and the steps what rate is seen
-        rate, end = rate_along(scaled, line, x, log_time, steps_for(log_time, rate, turn))
-    turns = jnp.round(end / jnp.pi) if symmetry == "centred" else jnp.zeros(2)
-    too_long = jnp.exp(log_time) * rate > turn * MOST_STEPS_IN_ONE_PIECE
-    steps = jnp.where(too_long, 8, steps_for(log_time, rate, turn))
-    most = jnp.where(too_long, 1, max_iterations)
-    first = newton_on_line(scaled, line, x, log_time, steps, turns, symmetry, tolerance, most)
-    angles = line.base + first.x * direction
-    log_time, turns = reduce_to_minimal(scaled, angles, first.log_time, steps, turns, symmetry)
-    reduced = log_time < first.log_time
-    again = Settings(turn, tolerance, jnp.maximum(most - first.iterations, 1), error)
-    newton, steps, change = solve_twice(
-        scaled, line, first.x, log_time, first.shot.rate, turns, symmetry, again
-    )
-    # Many periods of an unstable orbit are too long for Newton's method, and one is not.
-    status = jnp.where((first.status == Status.CONVERGED) | reduced, newton.status, first.status)
-    status = jnp.where(too_long, Status.BEYOND_HORIZON, status)
-    swing = jnp.minimum(1.0, _swing(line.base + x * direction))
-    status = jnp.where(_swing(angles) < _AT_EQUILIBRIUM * swing, Status.TRIVIAL_ROOT, status)
-    outcome = Outcome(
-        residual_of(scaled, newton, symmetry),
-        first.iterations + newton.iterations,
-        change[0],
-        change[1],
-        status,
-    )
-    known = _know_newton(scaled, line, newton, symmetry)
-    known = known.at[-2:].add(jnp.where(too_long, jnp.nan, 0.0))
-    values = jnp.stack([newton.x, newton.log_time]), known
-    given = PieceGiven(origin, direction, steps.astype(float))
-    equations = piece_equations(symmetry)
-    _, known = implicit(equations, values, parameters_of(pendulum, theta1), given)
-    return orbit_in_units(pendulum, Known(*known), turns, symmetry, outcome)
-
-
-def _know_newton(pendulum: Pendulum, line: Line, newton: LineNewton, symmetry: str) -> Array:
-    """The columns of `Known` where Newton's method ended, from its own last integration."""
-    start = released(*(line.base + newton.x * line.direction))
-    kappas = stability_of(newton.shot.matrix[None], symmetry, jnp)[1:]
-    states = [*jax.tree.leaves(start), *jax.tree.leaves(newton.shot.end)]
-    return jnp.stack([*states, jnp.exp(newton.log_time), hamiltonian(pendulum, start), *kappas])
-
-
-def _swing(angles: Array) -> Scalar:
-    """How far a release is from the nearest equilibrium [rad, up to 1]: the scale of all that is
-    small.
-    """
-    return jnp.max(jnp.abs(jnp.sin(angles)))
 
 
 def find_orbit(
@@ -279,45 +176,35 @@ def find_orbit(
     require_float64()
     if state is not None or period is not None:
         others = {"theta1": theta1, "branch": branch, "guess": guess, "ratio": ratio}
-        settings = crossing, turn, tolerance, max_iterations, error
-        others |= zip(_SETTINGS, settings, strict=True)
+        rest = crossing, turn, tolerance, max_iterations, error
+        others |= zip(_SETTINGS, rest, strict=True)
         return _through_state(pendulum, state, period, (symmetry, turns, keep), others)
-    _leave_out("without state", {"turns": turns, "keep": keep}, {"keep": "energy"})
+    leave_out("without state", {"turns": turns, "keep": keep}, {"keep": "energy"})
     theta1, crossing = number("theta1", theta1, unit="rad"), integer("crossing", crossing)
-    _check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
-    values = {
-        "turn": number("turn", turn, positive=True, unit="rad"),
-        "tolerance": number("tolerance", tolerance, positive=True),
-        # This may be traced: it bounds a loop.
-        "max_iterations": max_iterations
-        if is_traced(max_iterations)
-        else integer("max_iterations", max_iterations),
-    }
-    error = flag("error", error)
-    for name, value in values.items():
-        single(name, value)
-    settings = tuple(values.values())
+    check_request(pendulum, theta1, branch, guess, symmetry, ratio, crossing)
+    settings, error = _settings_of(turn, tolerance, max_iterations), flag("error", error)
     theta1 = jnp.asarray(theta1, jnp.float64)
     if guess is None:
         slow = (branch or ("in-phase" if ratio == 1 else "anti-phase")) == "in-phase"
         given = pendulum, theta1, slow, (crossing, float(ratio or 0)), settings
         return run_kept(_on_branch, given, (error,))
-    theta2, period = (jnp.asarray(value, jnp.float64) for value in _guess_of(guess))
-    if ratio is None:
-        directions, x = (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), theta2
-    else:
-        directions, x = (jnp.zeros(2), jnp.array([1.0, ratio])), theta1
+    return find_near_guess(pendulum, theta1, guess_of(guess), symmetry, ratio, settings, error)
 
-    def solve(x: Scalar, period: Scalar, symmetry: str) -> PeriodicOrbit:
-        return _near_guess(pendulum, theta1, directions, (x, period), symmetry, settings, error)
 
-    orbit = solve(x, period, symmetry or "brake")
-    if symmetry is not None or known_value(orbit.status) != Status.CONVERGED:
-        return orbit
-    centred = solve(orbit.theta2 if ratio is None else orbit.theta1, orbit.period, "centred")
-    if not _is_same(centred, orbit):
-        return orbit
-    return replace(centred, iterations=orbit.iterations + centred.iterations)
+def _settings_of(turn: Any, tolerance: Any, max_iterations: Any) -> tuple[Any, Any, Any]:
+    """The settings of Newton's method, checked; all may be traced, which for `max_iterations` means
+    that it bounds a loop.
+    """
+    if not is_traced(max_iterations):
+        max_iterations = integer("max_iterations", max_iterations)
+    values = {
+        "turn": number("turn", turn, positive=True, unit="rad"),
+        "tolerance": number("tolerance", tolerance, positive=True),
+        "max_iterations": max_iterations,
+    }
+    for name, value in values.items():
+        single(name, value)
+    return values["turn"], values["tolerance"], values["max_iterations"]
 
 
 # What `find_orbit` takes from a state not, with its defaults.
@@ -328,95 +215,8 @@ def _through_state(
     pendulum: Any, state: Any, period: Any, options: tuple[Any, Any, Any], others: dict[str, Any]
 ) -> PeriodicOrbit:
     """The orbit near a motion, once what is asked has been looked at."""
-    _leave_out("with state and period", others, _SETTINGS)
+    leave_out("with state and period", others, _SETTINGS)
     return orbit_through(pendulum, swinging_numbers(pendulum), request_of(state, period, *options))
-
-
-def _leave_out(when: str, given: dict[str, Any], defaults: dict[str, Any]) -> None:
-    """Refuses arguments that mean nothing here; None where there is no default."""
-    for name, value in given.items():
-        default = defaults.get(name)
-        plain = isinstance(value, (bool, int, float, str))
-        if value is not default and not (plain and value == default):
-            raise ValueError(f"{name} must not be given {when}, got {shown(value)}: leave it out")
-
-
-def _check_request(
-    pendulum: Pendulum | Any,
-    theta1: Scalar,
-    branch: Any,
-    guess: Any,
-    symmetry: Any,
-    ratio: Any,
-    crossing: int,
-) -> None:
-    """Refuses what cannot be asked, as far as the values are known before tracing."""
-    check_pendulum(pendulum)
-    words = ("branch", branch, BRANCHES), ("symmetry", symmetry, RELEASED_SYMMETRIES)
-    for name, value, known in words:
-        if value is not None:
-            one_of(name, value, known)
-    if ratio is not None:
-        one_of("ratio", ratio, (1, -1))
-    at_most_one(branch=branch, guess=guess)
-    if branch is None and guess is None and ratio is None:
-        raise ValueError(
-            "branch must be given, or guess=(theta2, period), or ratio=1 or -1; got none of them"
-        )
-    if symmetry is not None and guess is None:
-        raise ValueError(
-            f"symmetry goes with guess, got {symmetry!r} alone: orbits on a branch are centred"
-        )
-    if crossing > 1 and (branch is None or ratio is not None):
-        raise ValueError(f"crossing must be 1 but with branch alone, got {crossing}: leave it out")
-    _check_release(pendulum, theta1)
-    angle1 = known_value(theta1)
-    if guess is not None:
-        _check_guess(guess, angle1)
-    elif angle1 is not None and _multiple_of_pi(angle1):
-        raise ValueError(
-            f"theta1 must not be a multiple of 180 degrees on a branch, got "
-            f"{math.degrees(angle1):g} degrees: "
-            "the branches pass there only in equilibrium"
-        )
-
-
-def _check_release(pendulum: Pendulum, theta1: Scalar) -> None:
-    """Refuses an angle that is none, and a pendulum that does not swing."""
-    for name, value in {"theta1": theta1, **vars(pendulum)}.items():
-        single(name, value)
-    gravity, angle1 = known_value(pendulum.g), known_value(theta1)
-    if angle1 is not None and not math.isfinite(angle1):
-        raise ValueError(f"theta1 must be a finite number [rad], got {angle1}: give another theta1")
-    if gravity is not None and not gravity > 0:
-        raise ValueError(
-            f"g must be positive for an orbit, got {gravity:g}: nothing swings back without gravity"
-        )
-
-
-def _check_guess(guess: Any, angle1: float | None) -> None:
-    """Refuses a guess that is an equilibrium or has no period."""
-    theta2, period = (known_value(value) for value in _guess_of(guess))
-    if period is not None and not period > 0:
-        raise ValueError(f"period must be positive [s], got {period:g}: give another guess")
-    if angle1 is None or theta2 is None:
-        return
-    if _multiple_of_pi(angle1) and _multiple_of_pi(theta2):
-        raise ValueError(
-            f"theta2 must not be a multiple of 180 degrees with theta1 at {math.degrees(angle1):g} "
-            f"degrees, "
-            f"got {math.degrees(theta2):g} degrees: that is an equilibrium"
-        )
-
-
-def _guess_of(guess: Any) -> tuple[Scalar, Scalar]:
-    """theta2 [rad] and the period [s] of a guess, checked."""
-    theta2, period = several("guess", guess, "a pair (theta2, period)", 2)
-    for name, value in (("theta2", theta2), ("period", period)):
-        single(f"guess of {name}", value)
-    return number("guess of theta2", theta2, unit="rad"), number(
-        "guess of period", period, unit="s"
-    )
 
 
 def swinging_pendulum(pendulum: Any) -> Pendulum:
@@ -447,21 +247,3 @@ def swinging_numbers(pendulum: Any) -> Pendulum:
         known = known_value(leaf)
         numbers[name] = leaf if known is None else known
     return swinging_pendulum(Pendulum(**numbers))  # which refuses what `jit` traces
-
-
-def _multiple_of_pi(angle: float) -> bool:
-    nearest = math.pi * round(angle / math.pi)
-    # Below 1e-100 the products of two amplitudes leave the range of float64: that is zero, too.
-    return abs(angle - nearest) <= max(4 * sys.float_info.epsilon * abs(nearest), 1e-100)
-
-
-def _is_same(one: PeriodicOrbit, other: PeriodicOrbit) -> bool:
-    """Whether two converged orbits are one: angles and periods agree to `_SAME_ORBIT`."""
-    known = [
-        float(known_value(leaf) or 0.0)
-        for o in (one, other)
-        for leaf in (o.theta1, o.theta2, o.period)
-    ]
-    apart = max(abs(known[0] - known[3]), abs(known[1] - known[4]))
-    longer = abs(known[2] / known[5] - 1)
-    return known_value(one.status) == Status.CONVERGED and max(apart, longer) < _SAME_ORBIT

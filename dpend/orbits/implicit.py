@@ -1,9 +1,9 @@
 """The implicit function theorem: what is known of a root, as a function of its parameters.
 
 A root of F(root, parameters) = 0 moves by d root = -(dF/d root)^-1 (dF/d parameters) d parameters.
-One rule serves the equations of segments and those of shooting in one piece. Its own Jacobians may
-be differentiated forwards again: second derivatives are `jax.hessian`'s. The parameters are l2/l1,
-m2/m1 and the value of what is held fixed at the release, in natural units.
+One rule serves the equations of segments and those of shooting in one piece, and derivatives of
+every order, forwards and backwards. The parameters are l2/l1, m2/m1 and the value of what is held
+fixed at the release, in natural units.
 """
 
 from collections.abc import Callable
@@ -68,26 +68,48 @@ class Equations(NamedTuple):
     known: Callable[..., Array]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def implicit(equations: Equations, values: Any, parameters: Array, given: Any) -> Any:
     """`values`, a root and what is known of it, as a function of `parameters`, shape (3,).
 
-    The values were found before and come back as they are. Both Jacobians of the rule are taken
-    forwards and do not depend on the tangent, so that the rule can be transposed although the
-    flow's loop cannot.
+    The values were found before and come back as they are.
 
     Arguments:
         given: an `ArcGiven` or `PieceGiven`: constants; as floats, since a rule's arguments need
             tangents.
     """
-    return values
+    return _differentiate(equations, 0, values, parameters, given)
 
 
-@implicit.defjvp
-def _implicit_jvp(equations: Equations, primals: tuple, tangents: tuple) -> tuple:
-    # By way of this rule, so that second derivatives know how the root moves.
-    root, known = implicit(equations, *primals)
-    _, parameters, given = primals
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _differentiate(
+    equations: Equations, order: int, values: Any, parameters: Array, given: Any
+) -> Any:
+    """The derivative of this order of `values`, with one more axis of parameters for each order.
+
+    JAX is told that the derivative of one order changes by the next order times a tangent. All
+    orders are computed forwards, so that no rule transposes the flow's loop, which cannot be
+    transposed, and `grad` of `grad` works as `hessian` does.
+    """
+    return _compute(equations, order, values, parameters, given)
+
+
+@_differentiate.defjvp
+def _differentiate_jvp(
+    equations: Equations, order: int, primals: tuple, tangents: tuple
+) -> tuple[Any, Any]:
+    here, slopes = (_differentiate(equations, n, *primals) for n in (order, order + 1))
+    return here, jax.tree.map(lambda slope: slope @ tangents[1], slopes)
+
+
+def _compute(equations: Equations, order: int, values: Any, parameters: Array, given: Any) -> Any:
+    """The derivative of this order, by the equations; from the second on of the one before it."""
+    if order == 0:
+        return values
+    if order > 1:
+        lower = partial(_compute, equations, order - 1, values, given=given)
+        return jax.jacfwd(lower)(parameters)
+    # By way of the rule, so that second derivatives know how the root moves.
+    root, _ = implicit(equations, values, parameters, given)
     by_root, by_parameters = equations.linearise(equations.symmetry, root, parameters, given)
     moves = -jnp.linalg.solve(by_root, by_parameters)
 
@@ -97,8 +119,7 @@ def _implicit_jvp(equations: Equations, primals: tuple, tangents: tuple) -> tupl
 
         return jax.jvp(again, (root, parameters), (move, unit))[1]
 
-    slopes = jax.vmap(along, (1, 1), 1)(moves, jnp.eye(len(parameters)))
-    return (root, known), (moves @ tangents[1], slopes @ tangents[1])
+    return moves, jax.vmap(along, (1, 1), 1)(moves, jnp.eye(len(parameters)))
 
 
 def _pendulum(parameters: Array) -> Pendulum:

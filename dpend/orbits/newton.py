@@ -171,12 +171,7 @@ def _rounding(pendulum: Pendulum, point: Array, arc: Arc) -> Array:
     none = jnp.zeros(2)
     angles, rest = jnp.append(none, sizes[:2]), jnp.append(none, sizes[2:])
     ends = by_symmetry(
-        arc,
-        centred=lambda: angles,
-        brake=lambda: rest,
-        odd=lambda: sizes,
-        passing=lambda: angles,
-        none=lambda: sizes,
+        arc, lambda: sizes, centred=lambda: angles, brake=lambda: rest, passing=lambda: angles
     )
     unit = _ROUNDINGS * jnp.maximum(1.0, pendulum.m2 / pendulum.m1) ** 0.25
     return unit * jnp.concatenate([jnp.tile(sizes, SEGMENTS - 1), ends, none])
@@ -199,14 +194,7 @@ def _errors(
     def moving() -> Array:
         return _of_moving(pendulum, n.point)
 
-    pair = by_symmetry(
-        arc,
-        centred=at_aim,
-        brake=at_aim,
-        odd=at_aim,
-        passing=moving,
-        none=lambda: at_aim().at[0].set(moving()[0]),
-    )
+    pair = by_symmetry(arc, at_aim, passing=moving, none=lambda: at_aim().at[0].set(moving()[0]))
     wanted = jnp.concatenate([pair, time[None]])
     pulled = solve_transposed(n.factors, wanted.T).T * _rounding(pendulum, n.point, arc)
     off, pace = jnp.sqrt(jnp.sum(pulled[0] ** 2)), wanted[0] @ tangent
@@ -320,14 +308,9 @@ def _describe_root(pendulum: Pendulum, n: _Newton, aim: Aim, arc: Arc) -> Solved
 
     level, slope = jax.jvp(energy, (n.point[:4],), (tangent[:4],))
     wanted = jnp.ceil(jnp.nan_to_num(jnp.max(s.turn) / TURN, nan=1.0))
-
-    def angles() -> Array:
-        return n.update[:2]
-
-    def rates() -> Array:
-        return n.update[2:4] / _inertia(pendulum)
-
-    change = by_symmetry(arc, centred=angles, brake=angles, odd=angles, passing=rates, none=angles)
+    change = by_symmetry(
+        arc, lambda: n.update[:2], passing=lambda: n.update[2:4] / _inertia(pendulum)
+    )
     return Solved(
         point=n.point,
         tangent=tangent,

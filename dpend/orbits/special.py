@@ -2,13 +2,14 @@
 off.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from dpend.orbits.curve import Curve, select
+from dpend.orbits.extrema import add_extrema
 from dpend.orbits.follow import FamilyProblem
 from dpend.orbits.newton import Solved
 from dpend.orbits.orbit import orbits_of, slopes_of
@@ -26,7 +27,7 @@ from dpend.orbits.samples import (
     values_of_tests,
 )
 from dpend.orbits.walk import CROSSING
-from dpend.orbits.zones import Zone, find_zones, merge_samples, outside, overlaps
+from dpend.orbits.zones import Zone, find_zones, outside, overlaps
 
 
 def special_points(
@@ -38,7 +39,7 @@ def special_points(
     track = Track(problem, curve, arclength)
     samples = Samples(arclength[len(arclength) - len(rows.point) :], rows)
     zones = find_zones(track, samples)
-    samples = outside(zones, _with_extrema(track, outside(zones, samples, with_ends=True)))
+    samples = outside(zones, add_extrema(track, outside(zones, samples, with_ends=True)))
     changes = _changes(problem, samples)
     places = [
         Spot("crossing", z.place, CROSSING, z.row_at(problem, z.place), z.steepness(problem), None)
@@ -47,88 +48,6 @@ def special_points(
     if changes:
         places += _describe(changes, _locate(track, changes, zones), places, samples.where, problem)
     return [_special(problem, spot) for spot in sorted(places, key=lambda spot: spot.where)]
-
-
-# Rounds in which an extremum is looked for between points, by parabolas.
-_VERTICES = 5
-
-
-def _with_extrema(track: Track, samples: Samples) -> Samples:
-    """The samples, and more about every extremum between them that may reach beyond a value that is
-    tested: two changes of sign within a step would else not be seen.
-    """
-    symmetry = track.problem.symmetry
-    measure = measure_of(samples.rows, symmetry)
-    tests = test_functions(symmetry)
-    ranged = [test for test in tests if test.kind.startswith(("above", "below", "resonance"))]
-    levels = np.arcsinh([-float(test.value(samples.rows, 0 * measure)[0]) for test in ranged])
-    triples = []
-    heights: list[tuple[Callable[[Solved], np.ndarray], np.ndarray]] = [
-        (lambda rows: np.arcsinh(measure_of(rows, symmetry)), levels),
-        (lambda rows: rows.energy_slope, np.zeros(1)),
-    ]
-    if any(test.kind == "fold_theta1" for test in tests):
-        heights.insert(1, (lambda rows: rows.tangent[:, 0], np.zeros(1)))
-    for function, targets in heights:
-        h = function(samples.rows)
-        before, here, after = h[:-2], h[1:-1], h[2:]
-        highest, lowest = (here >= before) & (here >= after), (here <= before) & (here <= after)
-        sense = np.where(highest, 1.0, np.where(lowest, -1.0, 0.0))
-        with np.errstate(over="ignore"):  # the energy of fast rotation is steep
-            wide = np.sinh(h)
-        reach = _in_reach(h, sense, targets) | _in_reach(wide, sense, np.sinh(targets))
-        (near,) = np.nonzero((sense != 0) & reach)
-        triples += [
-            (function, samples.where[i : i + 3].copy(), h[i : i + 3] * sense[i], sense[i])
-            for i in near
-        ]
-    more = []
-    for _ in range(_VERTICES if triples else 0):
-        spots = np.array([_vertex(place, height) for _, place, height, _ in triples])
-        rows = track.rows_at(spots)
-        more.append(Samples(spots, rows))
-        for j, (function, place, height, sense) in enumerate(triples):
-            _narrow(place, height, spots[j], sense * function(select(rows, slice(j, j + 1)))[0])
-    return merge_samples(samples, *more)
-
-
-def _in_reach(h: np.ndarray, sense: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Of points between two others, the highest or lowest of the three: whether the function may
-    get to a target.
-
-    A parabola's vertex lies beyond the highest of three even points by an eighth of their range at
-    most.
-    """
-    before, here, after = h[:-2], h[1:-1], h[2:]
-    with np.errstate(invalid="ignore"):  # beyond any float
-        room = 0.5 * np.maximum(np.abs(before - here), np.abs(after - here))
-        beyond = sense[:, None] * (targets - here[:, None])
-        return np.asarray(np.any((beyond >= 0) & (beyond <= room[:, None]), axis=1))
-
-
-def _vertex(place: np.ndarray, height: np.ndarray) -> float:
-    """Where the parabola through three points, the middle one the highest, is highest; not on one
-    of them.
-    """
-    left, right = place[1] - place[0], place[2] - place[1]
-    fall_left, fall_right = (height[1] - height[0]) / left, (height[1] - height[2]) / right
-    total = fall_left + fall_right
-    shift = 0.5 * (fall_left * right - fall_right * left) / total if total > 0 else 0.0
-    if abs(shift) < 1e-3 * min(left, right):
-        shift = 1e-3 * (right if right > left else -left)
-    return float(np.clip(place[1] + shift, place[0] + 1e-3 * left, place[2] - 1e-3 * right))
-
-
-def _narrow(place: np.ndarray, height: np.ndarray, spot: float, top: float) -> None:
-    """The three points about the maximum, when `spot` is known too."""
-    points = np.append(place, spot)
-    heights = np.append(height, top)
-    order = np.argsort(points)
-    middle = int(np.clip(np.argmax(heights[order]), 1, 2))
-    place[:], height[:] = (
-        points[order][middle - 1 : middle + 2],
-        heights[order][middle - 1 : middle + 2],
-    )
 
 
 class _Change(NamedTuple):
