@@ -56,7 +56,7 @@ LONG_FUNCTIONS = {
     "newton_on_line", "_near_guess", "_accept", "_first_rest",  # straight lines of one computation
     "check_gradient", "_dopri8",
 }  # fmt: skip
-BRANCHING = {"find_orbit", "_check_request", "follow_curve"}
+BRANCHING = {"follow_curve"}
 # The command line prints results and, on standard error, what it does.
 PRINTING = ["report", "tables", "terminal"]
 
