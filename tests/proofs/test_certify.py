@@ -203,6 +203,7 @@ def test_orbits_that_never_rest_are_proved(symmetry):
     assert read_certificate(record).identifier == certificate.identifier
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("symmetry", MOVING)
 def test_fifty_digits_of_an_orbit_that_never_rests(symmetry):
     coarse, fine = answer(proofs.moving(symmetry)), answer(proofs.moving(symmetry), 50)
@@ -213,6 +214,7 @@ def test_fifty_digits_of_an_orbit_that_never_rests(symmetry):
     assert Fraction(fine.kappa.radius) < Fraction(1, 10**18)
 
 
+@pytest.mark.slow
 def test_orbits_between_hyperbolic_and_elliptic_are_decided():
     """kappa is 1 to 4e-10 here: float64 does not tell, forty digits do."""
     question = Question(proofs.PAPER, Release("20.306301528593956", "deg"),
