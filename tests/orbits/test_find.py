@@ -432,3 +432,15 @@ def test_no_error_is_above_ten_times_its_estimate():
     assert len(rows) > 60
     assert np.min(ratios) > 0.1
     assert np.all((np.median(ratios, axis=0) > 2) & (np.median(ratios, axis=0) < 20))
+
+
+@pytest.mark.slow
+def test_gradients_of_gradients_are_hessians():
+    def theta2(theta1):
+        return dpend.find_orbit(dpend.Pendulum(), theta1, branch="in-phase").theta2
+
+    gradient = jax.grad(theta2)
+    twice = float(jax.grad(gradient)(0.7))
+    assert twice == pytest.approx(float(jax.hessian(theta2)(0.7)), rel=1e-12)
+    central = (gradient(0.7 + 1e-4) - gradient(0.7 - 1e-4)) / 2e-4
+    assert twice == pytest.approx(float(central), rel=1e-6)
