@@ -91,8 +91,8 @@ _VECTOR_WIDTH = ("xla_cpu_prefer_vector_width", "512")
 
 
 def known_to_xla(*names: str) -> bool:
-    """Whether the installed XLA mentions every one of `names` (a search of its shared library, a
-    few milliseconds).
+    """Whether the installed XLA has flags of all these names: a search of its shared library, a few
+    milliseconds, for whole words. A flag that was taken out leaves its name within longer text.
     """
     library = Path(jaxlib.__file__).parent / "libjax_common.so"
     try:
@@ -100,7 +100,7 @@ def known_to_xla(*names: str) -> bool:
             library.open("rb") as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text,
         ):
-            return all(text.find(name.encode()) >= 0 for name in names)
+            return all(text.find(b"\0" + name.encode() + b"\0") >= 0 for name in names)
     except (OSError, ValueError):
         return False
 
@@ -124,8 +124,9 @@ def _extended_flags(flags: str) -> str:
     name, width = _VECTOR_WIDTH
     if not spoken_of(name) and _has_avx512() and known_to_xla(name):
         added.append(f"--{name}={width}")
+    # This flag takes any name; XLA passes over those that it does not know.
     extra = [option for option in (_SHARE_OUTPUTS, _LOOP_IN_ONE_KERNEL) if not spoken_of(option[0])]
-    if extra and known_to_xla("xla_backend_extra_options", *(name for name, _ in extra)):
+    if extra and known_to_xla("xla_backend_extra_options"):
         added.append(
             "--xla_backend_extra_options=" + ",".join(f"{name}={value}" for name, value in extra)
         )

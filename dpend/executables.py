@@ -26,7 +26,6 @@ import jaxlib
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
-from dpend._runtime import known_to_xla
 from dpend.checks import is_traced
 
 _HEAD = b"dpend executable 1\n"
@@ -82,11 +81,21 @@ def _compile(function: Any, arguments: tuple, static: tuple) -> Callable[..., An
     _use_cache(False)
     try:
         lowered = function.lower(*arguments, *static)
-        options = _QUICKLY if known_to_xla(*_QUICKLY) else None
-        compiled: Callable[..., Any] = lowered.compile(compiler_options=options)
+        compiled: Callable[..., Any] = lowered.compile(compiler_options=_options())
     finally:
         _use_cache(kept)
     return compiled
+
+
+def _options() -> dict[str, Any]:
+    """Those of `_QUICKLY` that the installed XLA knows: it refuses to compile with any other."""
+    program = jax.jit(lambda: 0).lower()
+    known = {}
+    for name, value in _QUICKLY.items():
+        with contextlib.suppress(jax.errors.JaxRuntimeError):
+            program.compile(compiler_options={name: value})
+            known[name] = value
+    return known
 
 
 def _use_cache(wanted: bool) -> None:

@@ -86,6 +86,13 @@ def test_what_is_not_as_it_was_written_is_ignored_and_written_anew(folder):
         assert executables._read(path, path.stem) is not None
 
 
+def test_options_that_this_xla_does_not_know_are_left_out(folder, monkeypatch):
+    known = executables._options()
+    monkeypatch.setattr(executables, "_QUICKLY", {**known, "xla_cpu_no_such_option": True})
+    assert executables._options() == known
+    assert answer() == [np.asarray(part).tobytes() for part in solve(*GIVEN)]
+
+
 def test_a_file_that_others_may_write_is_not_read(folder):
     answer()
     (path,) = folder.iterdir()

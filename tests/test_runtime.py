@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -112,6 +113,18 @@ def test_options_are_added_only_where_the_user_is_silent():
 def test_unknown_options_are_found_out():
     assert _runtime.known_to_xla("xla_backend_extra_options")
     assert not _runtime.known_to_xla("xla_cpu_no_such_option_as_this")
+
+
+def test_xla_takes_the_options():
+    """A sine that three results share stands once in what XLA makes of them, not three times."""
+
+    def shared(x, y):
+        sine, cosine = jnp.sin(x), jnp.cos(x)
+        turned = sine * y + cosine
+        return turned / (1 + cosine * cosine), turned * sine, y + turned
+
+    lanes = jnp.ones(1000)
+    assert jax.jit(shared).lower(lanes, lanes).compile().as_text().count(" sine(") == 1
 
 
 @pytest.mark.slow

@@ -53,7 +53,8 @@ def _gauss() -> tuple[np.ndarray, np.ndarray]:
 def _lobatto() -> tuple[np.ndarray, np.ndarray]:
     """-1, the zeros of P_7', 1 and their weights: zeros of P_6 - x P_7, whose slope is -8 P_7."""
     n = NODES - 1
-    inner = np.polynomial.legendre.legroots(np.polynomial.legendre.legder(np.eye(NODES)[n]))
+    # All roots are real; NumPy calls them complex from 2.5 on.
+    inner = np.polynomial.legendre.legroots(np.polynomial.legendre.legder(np.eye(NODES)[n])).real
     x = np.concatenate([[-1.0], inner, [1.0]]).astype(np.longdouble)
     for _ in range(3):
         p = _legendre(x)
