@@ -31,7 +31,7 @@ from dpend.checks import is_traced
 _HEAD = b"dpend executable 1\n"
 # Half of XLA's time goes into these two, and a program that runs once gains nothing by them: a
 # search for an orbit takes 2 s to compile in place of 3.7 s, and 5 ms as before.
-_QUICKLY = {
+_QUICKLY: dict[str, str | bool] = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_disable_hlo_passes": "while-loop-invariant-code-motion",
 }
@@ -87,10 +87,10 @@ def _compile(function: Any, arguments: tuple, static: tuple) -> Callable[..., An
     return compiled
 
 
-def _options() -> dict[str, Any]:
+def _options() -> dict[str, str | bool]:
     """Those of `_QUICKLY` that the installed XLA knows: it refuses to compile with any other."""
     program = jax.jit(lambda: 0).lower()
-    known = {}
+    known: dict[str, str | bool] = {}
     for name, value in _QUICKLY.items():
         with contextlib.suppress(jax.errors.JaxRuntimeError):
             program.compile(compiler_options={name: value})
