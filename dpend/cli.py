@@ -23,7 +23,12 @@ from dpend import (
     section_commands,
     simulation_commands,
 )
-from dpend._runtime import catch_interrupts, leave_quietly, take_all_cores
+from dpend._runtime import (
+    catch_interrupts,
+    collect_garbage_from_here,
+    leave_quietly,
+    take_all_cores,
+)
 from dpend.executables import keep_executables
 from dpend.options import app
 from dpend.terminal import tell_error
@@ -63,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "ignore", message=".*persistent compilation cache"
     )  # a cache only saves time
     catch_interrupts()
+    collect_garbage_from_here()
     status = _run(sys.argv[1:] if arguments is None else list(arguments))
     leave_quietly()
     if _flush() is not None:  # Python would try once more when it ends, and say so with a traceback
