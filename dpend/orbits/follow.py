@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from dpend.checks import Scalar
+from dpend.executables import run_kept
 from dpend.mechanics.pendulum import Pendulum
 from dpend.orbits.arc import PARTS, SEGMENTS, UNKNOWNS, Arc, arc_of, lay_arc
 from dpend.orbits.curve import (
@@ -80,9 +81,9 @@ class FamilyProblem:
                 _pad(steps[some]).astype(int),
                 np.int64(count),
             )
-            _, table, _, _ = walk(
-                self.natural, start_at(points[0], rows[0], 1.0, 1), np.float64(1.0), tasks, self.arc
-            )
+            start = start_at(points[0], rows[0], 1.0, 1)
+            given = self.natural, start, np.float64(1.0), tasks, self.arc
+            _, table, _, _ = run_kept(walk, given)
             tables.append(np.asarray(table)[:count])
         return unpack_table(np.concatenate(tables))
 
@@ -95,9 +96,8 @@ class FamilyProblem:
         tables: list[np.ndarray] = []
         count, end, begin = 0, "", start
         while not end and count < reach.points:
-            start, table, more, status = walk(
-                self.natural, start, np.float64(reach.step), tasks, self.arc
-            )
+            given = self.natural, start, np.float64(reach.step), tasks, self.arc
+            start, table, more, status = run_kept(walk, given)
             tables.append(np.asarray(table)[: int(more)])
             rows, count = unpack_table(np.concatenate(tables)), count + int(more)
             end = ("", "ended", "lost")[int(status)]

@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array
 
 from dpend.checks import Scalar, known_value
+from dpend.executables import run_kept
 from dpend.mechanics.pendulum import Pendulum, hamiltonian, released
 from dpend.mechanics.units import natural
 from dpend.orbits.arc import PARTS
@@ -57,7 +58,8 @@ def find_near_guess(
         directions, x = (jnp.zeros(2), jnp.array([1.0, ratio])), theta1
 
     def solve(x: Scalar, period: Scalar, symmetry: str) -> PeriodicOrbit:
-        return _near_guess(pendulum, theta1, directions, (x, period), symmetry, settings, error)
+        given = pendulum, theta1, directions, (x, period), settings
+        return run_kept(_near_guess, given, (symmetry, error))
 
     orbit = solve(x, period, symmetry or "brake")
     if symmetry is not None or known_value(orbit.status) != Status.CONVERGED:
@@ -74,8 +76,8 @@ def _near_guess(
     theta1: Scalar,
     directions: tuple[Array, Array],
     start: tuple[Scalar, Scalar],
-    symmetry: str,
     settings: tuple,
+    symmetry: str,
     error: bool,
 ) -> PeriodicOrbit:
     """The orbit to which Newton's method leads from `start` = (x, period), with its minimal period,
